@@ -189,6 +189,11 @@ def robots() -> Frames:
     return frames_of(scene, run, camera=camera, contact_points=False)
 
 
+def arm() -> Frames:
+    """The Panda of its guide, which lifts a mug."""
+    return frames_of(*runs_of_guide("arm")[-1])
+
+
 def identify() -> Frames:
     """Positions with noise, and simulations with the friction guessed first and the one that was found."""
     bodies = [
@@ -381,6 +386,7 @@ PICTURES: dict[str, Callable[[], Frames]] = {
     "guides/scenes": scenes,
     "guides/joints": joints,
     "guides/robots": robots,
+    "guides/arm": arm,
     "guides/identify": identify,
     "guides/plan": plan,
     "guides/learn": learn,

@@ -34,6 +34,8 @@ from dano.contact import (
     CentroidLaw as CentroidLaw,
     Collider as Collider,
     ContactParams as ContactParams,
+    Distance as Distance,
+    distance as distance,
     DistributedLaw as DistributedLaw,
     overlap as overlap,
     Patch as Patch,
@@ -112,7 +114,7 @@ from dano.scene_file import load_object as load_object, load_scene as load_scene
 from dano.exchange import export_object as export_object, export_robot as export_robot
 
 from dano.names import keep_old_name as _keep_old_name
-from dano.scene import offer as _offer
+import dano.scene as _scene
 
 __version__ = "0.1.0"
 
@@ -127,7 +129,9 @@ def __getattr__(name: str) -> _Any:
 
 
 # Scenes do not know reports, which are above them, and importing dano imports none.
-_offer("film", lambda *given, **options: _importlib.import_module("dano.report").film_run(*given, **options))
-_offer("show", lambda *given: _importlib.import_module("dano.report").show_run(*given))
+_scene.offer(
+    "film", lambda *given, **options: _importlib.import_module("dano.report").film_run(*given, **options)
+)
+_scene.offer("show", lambda *given: _importlib.import_module("dano.report").show_run(*given))
 _keep_old_name("dano.identify", "dano.identification")
 _keep_old_name("dano.plan", "dano.planning")

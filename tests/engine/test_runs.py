@@ -183,13 +183,13 @@ position = [0, 0, 1]
 
 def test_old_names_work_and_say_the_new_one():
     with pytest.warns(FutureWarning, match="write `from dano.identification import Motion`"):
-        from dano.identify import Motion
+        from dano.identify import Motion  # pyright: ignore[reportMissingImports]
     with pytest.warns(FutureWarning, match="write `from dano.planning import Task`"):
-        from dano.plan import Task
+        from dano.plan import Task  # pyright: ignore[reportMissingImports]
     assert (Motion, Task) == (dano.Motion, dano.Task)
     assert callable(dano.identify) and callable(dano.plan)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert dano.report.VideoOptions is not None
     with pytest.raises(AttributeError, match="no attribute 'reports'"):
-        dano.reports
+        _ = dano.reports

@@ -686,8 +686,7 @@ def test_parameters_are_text_as_on_the_command_line_and_masses_are_kilograms():
     push = scene.control(ball=dict(force=(1.0, 0, 0)))
     heavier = scene.replace_body("ball", mass_scale=1.6)
     seen = dano.simulate(heavier, n_steps=20, controls=push)
-    rows = jax.tree.map(lambda x: jnp.repeat(x[None], 20, axis=0), push)
-    fit = dano.identify(scene, seen, ["ball.mass_scale:0.5:5"], controls=rows, noise=dict(position=1e-4))
+    fit = dano.identify(scene, seen, ["ball.mass_scale:0.5:5"], controls=push, noise=dict(position=1e-4))
     assert fit.values["ball.mass_scale"] == pytest.approx(1.6, rel=1e-6)
     mass, error = fit.masses["ball"]
     assert mass == pytest.approx(0.8, rel=1e-6)
@@ -695,4 +694,4 @@ def test_parameters_are_text_as_on_the_command_line_and_masses_are_kilograms():
     assert "mass of ball [kg]" in str(fit) and fit.to_dict()["masses"]["ball"] == [mass, error]
     for text, message in (("ball.mas:0:1", "did you mean 'mass'"), ("bal.mass:0:1", "did you mean 'ball'")):
         with pytest.raises(ValueError, match=message):
-            dano.identify(scene, seen, [text], controls=rows)
+            dano.identify(scene, seen, [text], controls=push)

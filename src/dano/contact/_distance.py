@@ -4,14 +4,17 @@ With signed distances φ_A and φ_B in world coordinates, negative inside,
 
     d = min_x φ_A(x) + φ_B(x).
 
-Apart, the minimum is attained on the segment between the nearest points and is its length. Where solids
-overlap, it is minus the depth by which one has to be moved along the common normal until they only touch.
-The formula asks for nothing but signed distances, so it holds for shapes, hulls, meshes and fields alike.
+Apart, the minimum is attained on the segment between the nearest points and is its length. Where a face or
+something smooth overlaps, it is minus the depth by which one has to be moved along the common normal until
+they only touch. The formula asks for nothing but signed distances, so it holds for shapes, hulls, meshes and
+fields alike. Only where an edge has crossed an edge is the minimum a kink, less deep than the shortest way
+out; for shapes with edges that is searched among directions instead: d = max_n min_A n·p − max_B n·q.
 
 Minima are searched from points of both surfaces: for solids that are not convex, those of a lattice decide
 which parts are found. Derivatives do not go through the search. That of d is the envelope theorem: a surface
 moves the distance by how fast it moves along the normal. Those of points and normal follow from the implicit
-function theorem at the minimum, where it is unique; between parallel faces it is not, and nearest points stay.
+function theorem at the minimum, where it is unique; between parallel faces it is not, and the points stay.
+Of edges that have crossed only d has derivatives.
 """
 
 from typing import Any, NamedTuple
@@ -40,6 +43,8 @@ _PROJECTIONS = 4
 # Where derivatives are taken: this share of the smaller size outside of the surfaces, where an edge or a
 # corner is smooth.
 _OUTSIDE = 1e-3
+# Shapes with edges that are kinks also from inside, and a sum of two gradients that is that of a kink.
+_EDGED, _UNEVEN = ("box", "cylinder"), 1e-2
 # Curvatures of the sum below this, per size, are those of parallel faces.
 _FLAT = 1e-3
 
@@ -81,11 +86,11 @@ def distance(
         ValueError: If one is no solid, both are unbounded, or `starts` is not in 2 … 64.
     """
     starts = checked_count("starts", starts, most=64)
-    solids = [_solid(*each) for each in (("a", a, pose_a), ("b", b, pose_b))]
-    bounded = [_is_bounded(solid) for solid in solids]
+    first, second = _solid("a", a, pose_a), _solid("b", b, pose_b)
+    bounded = _is_bounded(first), _is_bounded(second)
     if not any(bounded):
         raise ValueError("one of a and b must be bounded, got two half-spaces")
-    return _distance(*solids, tuple(bounded), starts)
+    return _distance(first, second, bounded, starts)
 
 
 def _solid(name: str, given: Any, pose: Pose | None) -> AbstractShape:
@@ -97,13 +102,13 @@ def _solid(name: str, given: Any, pose: Pose | None) -> AbstractShape:
     if isinstance(given, NeuralObject):
         if given.solid is None:
             raise ValueError(
-                f"{name} must have a surface, got an object made of samples: from_samples(field=…) gives it one"
+                f"{name} must have a surface, got an object made of samples: from_samples(field=…) has one"
             )
         given = given.solid
     if isinstance(given, AbstractField) and not isinstance(given, AbstractShape):
         raise ValueError(
-            f"{name} must be a shape or an object, got the density {type(given).__name__}, which has no surface:"
-            " NeuralObject.from_field makes an object of it"
+            f"{name} must be a shape or an object, got the density {type(given).__name__}, which has no"
+            " surface: NeuralObject.from_field makes an object of it"
         )
     shape = checked_kind(name, given, AbstractShape, hint=" or NeuralObject")
     if pose is None:
@@ -113,16 +118,16 @@ def _solid(name: str, given: Any, pose: Pose | None) -> AbstractShape:
 
 def _is_bounded(solid: AbstractShape) -> bool:
     bounds = solid.bounds
-    # Of what is traced only half-spaces are known to be unbounded, and their bounds do not depend on numbers.
-    return (
-        not bool(np.any(np.isinf(np.asarray(bounds)))) if not is_traced(bounds) else _traced_is_bounded(solid)
-    )
+    if is_traced(bounds):
+        return _kind(solid) != "half_space"
+    return not bool(np.any(np.isinf(np.asarray(bounds))))
 
 
-def _traced_is_bounded(solid: AbstractShape) -> bool:
-    while hasattr(solid, "shape") and isinstance(solid.shape, AbstractShape):
-        solid = solid.shape
-    return getattr(solid, "kind", "") != "half_space"
+def _kind(solid: AbstractShape) -> str:
+    """Of a shape, wherever it is put; empty of what is no primitive."""
+    while isinstance(inner := getattr(solid, "shape", None), AbstractShape):
+        solid = inner
+    return str(getattr(solid, "kind", ""))
 
 
 @eqx.filter_jit
@@ -159,13 +164,7 @@ def _minimum(
     def round_of(k, state):
         x, height, reach = state
         stepped = x + _newton(a, b, x, size)
-        # A turn about an axis that moves, by an angle that does not repeat.
-        angle = 2.399963 * k
-        turned = (
-            star + jnp.sin(angle) * jnp.roll(star, 1, axis=0) + jnp.cos(angle) * jnp.roll(star, 2, axis=0)
-        )
-        turned = turned / jnp.linalg.norm(turned, axis=0, keepdims=True)
-        around = x[:, :, None] + reach[None, :, None] * turned[:, None, :]
+        around = x[:, :, None] + reach[None, :, None] * _turned(star, k)[:, None, :]
         tried = jnp.concatenate([stepped[:, :, None], around], axis=2)
         heights = total(tried.reshape(3, -1)).reshape(tried.shape[1:])
         heights = jnp.where(jnp.isfinite(heights), heights, jnp.inf)
@@ -204,13 +203,17 @@ def _solved(
     return jnp.sum(axes * along[:, None, :], axis=2).T
 
 
-def _projected(solid: AbstractShape, x: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+def _projected(
+    solid: AbstractShape, x: Float[Array, "3 n"], times: int = _PROJECTIONS
+) -> Float[Array, "3 n"]:
     """Points on the surface, along the gradient of the distance."""
-    for _ in range(_PROJECTIONS):
+
+    def once(_, x):
         value, slope = solid.sdf_jet(x, 1)
         steep = jnp.sum(slope * slope, axis=0)
-        x = x - jnp.where(steep > 1e-6, value / jnp.where(steep > 1e-6, steep, 1), 0)[None] * slope
-    return x
+        return x - jnp.where(steep > 1e-6, value / jnp.where(steep > 1e-6, steep, 1), 0)[None] * slope
+
+    return jax.lax.fori_loop(0, times, once, x)
 
 
 def _centred(
@@ -244,6 +247,50 @@ def _centred(
     return points[:, jnp.argmin(uneven + jnp.where(heights <= lowest + resolution, 0, 10.0))]
 
 
+def _crossed(
+    a: AbstractShape,
+    b: AbstractShape,
+    x: Float[Array, "3"],
+    normal: Float[Array, "3"],
+    size: Float[Array, ""],
+) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """Points and normal of the shortest way out of two convex shapes whose edges have crossed.
+
+    The furthest point of a convex shape in a direction is the one that is nearest to a point far away there.
+    """
+    far = size * jnp.finfo(x.dtype).eps ** (-1 / 3)
+    star = jnp.asarray(even_directions(_STAR).T, x.dtype)
+
+    def ends(normals: Float[Array, "3 n"]) -> tuple[Array, Array, Array]:
+        p = _projected(a, x[:, None] - far * normals, 1)
+        q = _projected(b, x[:, None] + far * normals, 1)
+        return p, q, jnp.sum(normals * (p - q), axis=0)
+
+    def round_of(k, state):
+        normal, value, reach = state
+        tried = safe_normalize(normal[:, None] + reach * _turned(star, k), axis=0)
+        values = ends(tried)[2]
+        best = jnp.argmax(values)
+        better = values[best] > value
+        return (
+            jnp.where(better, tried[:, best], normal),
+            jnp.where(better, values[best], value),
+            jnp.where(better, reach, 0.5 * reach),
+        )
+
+    first = normal, ends(normal[:, None])[2][0], jnp.ones((), x.dtype)
+    normal = jax.lax.fori_loop(0, 2 * _ROUNDS, round_of, first)[0]
+    p, q, _ = ends(normal[:, None])
+    return p[:, 0], q[:, 0], normal
+
+
+def _turned(star: Float[Array, "3 n"], k: Array) -> Float[Array, "3 n"]:
+    """A star of directions, in each round another one: by an angle that does not repeat."""
+    angle = 2.399963 * k
+    turned = star + jnp.sin(angle) * jnp.roll(star, 1, axis=0) + jnp.cos(angle) * jnp.roll(star, 2, axis=0)
+    return turned / jnp.linalg.norm(turned, axis=0, keepdims=True)
+
+
 def _differentiable(
     a: AbstractShape,
     b: AbstractShape,
@@ -268,6 +315,10 @@ def _differentiable(
     right = slope_a + slope_b
     moved = x - _solved(curvature, (right - jax.lax.stop_gradient(right))[:, None], size)[:, 0]
     p, q, normal = ends(a, b, moved)
+    if all(_kind(solid) in _EDGED for solid in (a, b)):
+        crossed = (jnp.linalg.norm(right) > _UNEVEN) & (jnp.dot(p - q, normal) < 0)
+        found = _crossed(still_a, still_b, x, jax.lax.stop_gradient(normal), size)
+        p, q, normal = (jnp.where(crossed, y, z) for y, z in zip(found, (p, q, normal), strict=True))
     value = jax.lax.stop_gradient(jnp.dot(p - q, normal))
     outside = _OUTSIDE * size
     for solid, place in ((a, p - outside * normal), (b, q + outside * normal)):

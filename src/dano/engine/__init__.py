@@ -1,7 +1,7 @@
 """Engines: from a scene and a state to the next one, and everything built on that."""
 
 from dano.engine._compiling import compiled as compiled, compiler_options as compiler_options
-from dano.engine._controls import Policy as Policy
+from dano.engine._controls import held as held, Policy as Policy
 from dano.engine._finite import marked as marked
 from dano.engine._history import (
     contact_history as contact_history,

@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,6 +15,21 @@ from dano.maths import is_traced, library
 from dano.scene import Control, Scene, State
 
 Policy = Callable[[State, Float[Array, ""]], Control]
+
+
+class Held(eqx.Module):
+    """A policy that answers with one control at all times."""
+
+    control: Control
+
+    def __call__(self, state: State, time: Float[Array, ""]) -> Control:
+        """The control."""
+        return self.control
+
+
+def held(controls: Any) -> Any:
+    """Controls of which one step is given, as a policy; others as they are."""
+    return Held(controls) if isinstance(controls, Control) and controls.force.ndim == 2 else controls
 
 
 def check_control(scene: Scene, control: Control | None, leading: tuple[int, ...]) -> None:
@@ -74,7 +90,7 @@ def _repeated(control: Control, count: int) -> Control:
     return jax.tree.map(lambda x: library(x).broadcast_to(x, (count, *x.shape)), control)
 
 
-def asked(controls: Policy, scene: Scene, state: State, time: Float[Array, ""]) -> Control:
+def asked(controls: Any, scene: Scene, state: State, time: Float[Array, ""]) -> Control:
     """What a policy answers, while a rollout is traced.
 
     Raises:
@@ -84,13 +100,13 @@ def asked(controls: Policy, scene: Scene, state: State, time: Float[Array, ""]) 
         control: Any = controls(state, time)
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError(
-            "controls(state, time) is compiled, so it cannot branch on the numbers of a state or a time: write"
-            " jnp.where(time < 0.5, a, b) in place of `if`, and jnp in place of np"
+            "controls(state, time) is compiled, so it cannot branch on numbers of the state or the time:"
+            " write jnp.where(time < 0.5, a, b) in place of `if`, and jnp in place of np"
         ) from error
     if not isinstance(control, Control):
         raise ValueError(
-            "controls(state, time) must return a dano.Control, such as scene.control(ball=dict(force=…)) or"
-            f" dano.joint_control(scene, efforts), got {shown(control)}"
+            "controls(state, time) must return a dano.Control, as scene.control(ball=dict(force=…)) or"
+            f" dano.joint_control(scene, efforts) make it, got {shown(control)}"
         )
     try:
         check_control(scene, control, ())

@@ -379,7 +379,7 @@ def _way_out(report: Report, failed: np.ndarray) -> str:
     """What may help steps that did not converge."""
     if report.overflow is not None and np.atleast_1d(np.asarray(report.overflow))[failed].all():
         return "more points touch than there is room for: take a larger VariationalEngine(capacity=…)"
-    return "try a smaller timestep, or with CentroidLaw a smaller damper or smoothing"
+    return "try a smaller timestep, or with CentroidLaw a smaller damper or smoothing; see docs/troubles.md"
 
 
 def _say(scene: Scene, following: State, report: Report) -> None:

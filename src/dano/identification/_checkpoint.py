@@ -131,7 +131,8 @@ def _members(prefix: str, found: Solution | Iterate, simulations: int) -> dict[s
 
 def _blocks(data: dict[str, np.ndarray], prefix: str) -> State:
     joints = JOINT_QUANTITIES if f"{prefix}q" in data else ()
-    return State(**{name: jnp.asarray(data[prefix + name]) for name in (*STATE_SIZES, *joints)})
+    arrays: dict[str, Any] = {name: jnp.asarray(data[prefix + name]) for name in (*STATE_SIZES, *joints)}
+    return State(**arrays)
 
 
 def _solution(data: dict[str, np.ndarray], prefix: str) -> tuple[Solution, int]:

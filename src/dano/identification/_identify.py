@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.checks import checked_function, checked_items, checked_kind, checked_optional
-from dano.engine import AbstractEngine, checked_engine, Policy
+from dano.engine import AbstractEngine, checked_engine, held, Policy
 from dano.identification._checkpoint import Checkpoint, digest_of
 from dano.identification._parameters import (
     masses_of,
@@ -67,7 +67,8 @@ def identify(
         held_out: Motions that are not fitted, to measure the error on.
         state: Of bodies that a motion does not hold; one for all motions or one for each. Default for
             the orientation of the only body that moves: as in `Scene.initial_state`, which is said.
-        controls: Forces and torques [N, N m] of each step of each motion, or a policy as in `simulate`.
+        controls: Forces and torques [N, N m] of each step of each motion, or of one step for all, or a policy
+            as in `simulate`.
         initial: What to estimate of the state in which each window begins: "given" (nothing), "velocities"
             (with spins), "states" (all), or a list of quantities. Default: what the motion does not hold.
         noise: Standard deviations of the quantities that count: position [m], orientation [rad], velocity
@@ -85,6 +86,7 @@ def identify(
     Raises:
         ValueError: If an argument is out of range, does not fit the others, or makes too much work.
     """
+    controls = held(controls)
     _check(scene, state, controls, progress)
     options = checked_optional("options", options, IdentifyOptions) or IdentifyOptions()
     motions = _motions("observed", observed, scene, least=1)
@@ -97,9 +99,9 @@ def identify(
     setup = Setup(space, scene, controls, chosen, sigmas, options, checked_engine(engine))
     check_scales(scene, motions, options.window, state if isinstance(state, State) else None)
     kept = _kept(setup, motions, state, after)
-    held = _motions("held_out", held_out, scene)
+    beside = _motions("held_out", held_out, scene)
     try:
-        found = _fitted(setup, motions, held, state, after, kept, progress)
+        found = _fitted(setup, motions, beside, state, after, kept, progress)
     except np.linalg.LinAlgError as error:
         raise ValueError(
             "observed must be motions that the scene can follow, got some from which the simulation ends in"

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -162,7 +163,9 @@ def plan_windows(
         _control_rows(scene, forces, first_step, n_steps),
     )
     names = pieces[0]["start"]
-    start = {key: jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype) for key in names}
+    start: dict[str, Any] = {
+        key: jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype) for key in names
+    }
     rows = [piece["rows"] for piece in pieces]
     return Plan(windows, State(**start), n_steps, owner, rows, tuple(seen), tuple(weights), n_data)
 

@@ -251,7 +251,8 @@ def _rows(fit: Identification) -> list[tuple[str, tuple[str, str, str]]]:
                 else f"{name}[{', '.join(map(str, np.unravel_index(index, np.shape(value))))}]"
             )
             rows.append((label, (f"{mean:.6g}", f"{error:.3g}", f"{a:.6g} … {b:.6g}")))
-    return rows
+    kilograms = fit.masses.items()
+    return rows + [(f"mass of {name} [kg]", (f"{m:.6g}", f"{e:.3g}", "")) for name, (m, e) in kilograms]
 
 
 def _errors(fit: Identification) -> str:

@@ -116,17 +116,15 @@ def pd(
     if stiffness is None and not is_traced(scene.timestep) and rate * float(scene.timestep) > _FASTEST:
         most = _FASTEST / (2 * math.pi * float(scene.timestep))
         raise ValueError(f"frequency must be ≤ {most:.3g} Hz with this timestep, got {frequency}")
-    gains = [
-        None if gain is None else _numbers(label, gain, names, None).astype(dtype)
-        for label, gain in (("stiffness", stiffness), ("damping", damping))
-    ]
+    pull = None if stiffness is None else _numbers("stiffness", stiffness, names, None).astype(dtype)
+    brake = None if damping is None else _numbers("damping", damping, names, None).astype(dtype)
     if not callable(goal):
         goal = _numbers("goal", goal, names, [robot.home.get(name, 0.0) for name in names]).astype(dtype)
         _check_reach(scene, robot, names, goal)
     most = [math.inf] * len(names) if limits is False else [robot.efforts.get(n, math.inf) for n in names]
     if isinstance(limits, Mapping):
         most = _numbers("limits", limits, names, most)
-    return JointPD(scene, goal, *gains, rate, jnp.asarray(most, dtype), bool(gravity), places, names)
+    return JointPD(scene, goal, pull, brake, rate, jnp.asarray(most, dtype), bool(gravity), places, names)
 
 
 def _places(robot: Robot, scene: Scene) -> tuple[tuple[str, ...], tuple[int, ...]]:
@@ -143,8 +141,8 @@ def _places(robot: Robot, scene: Scene) -> tuple[tuple[str, ...], tuple[int, ...
             raise ValueError(f"robot must have hinges and slides, got joint {name!r} of several coordinates")
         if scene.joints[joint].motor is not None:
             raise ValueError(
-                f"robot must have no motors of its own, got one on joint {name!r}, which would pull, too: give"
-                " it commands by robot.control, or load the file with ignore='actuators'"
+                f"robot must have no motors of its own, got one on joint {name!r}, which would pull, too:"
+                " give it commands by robot.control, or load the file with ignore='actuators'"
             )
         places.append(scene.layout.coordinates[joint])
     if not places:
@@ -186,5 +184,6 @@ def _check_reach(scene: Scene, robot: Robot, names: tuple[str, ...], goal: Float
         low, high = (float(x) for x in limits)
         if not low - 1e-6 <= float(value) <= high + 1e-6:
             raise ValueError(
-                f"goal of joint {name!r} must lie in its limits [{low:.4g}, {high:.4g}], got {float(value):.4g}"
+                f"goal of joint {name!r} must lie in its limits [{low:.4g}, {high:.4g}],"
+                f" got {float(value):.4g}"
             )

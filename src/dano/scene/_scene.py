@@ -9,8 +9,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.checks import checked_items, checked_kind, checked_optional, shown
-from dano.contact import checked_parameter, ContactParams
-from dano.maths import AnyArray, by_numpy, checked_array, is_traced, library, Numbers, on_host
+from dano.contact import checked_parameter, ContactParams, Distance, distance
+from dano.maths import (
+    AnyArray,
+    by_numpy,
+    checked_array,
+    is_traced,
+    library,
+    Numbers,
+    on_host,
+    Pose,
+    quat_rotate,
+)
 from dano.names import did_you_mean
 from dano.notebook import card, cloud, plain
 from dano.objects import checked_inertia
@@ -388,8 +398,8 @@ class Scene(eqx.Module):
 
         Args:
             state: The state.
-            given: What it was made from, see `initial_state`: only bodies that were placed are judged by where
-                they are. Default: all of them.
+            given: What it was made from, see `initial_state`: only bodies that were placed are judged by
+                where they are. Default: all of them.
         """
         return [
             *doubts_of_scene(self.bodies, self.joints, self.contacts, self.gravity),
@@ -416,6 +426,24 @@ class Scene(eqx.Module):
         """
         self.check_state(state)
         return by_numpy(filled)(self.chains, state, self.timestep) if self.joints else state
+
+    def distance(self, state: State, a: str, b: str) -> Distance:
+        """Signed distance of two bodies [m], nearest points and normal, see `dano.distance`; for one state.
+
+        Raises:
+            ValueError: If there is no such body, one has no surface, or the state does not fit the scene.
+        """
+        self.check_state(state)
+        places = self.frames(state) if self.joints else state
+        solids, poses = [], []
+        for i in (self.index(a), self.index(b)):
+            body, turn = self.bodies[i], places.orientation[i]
+            arm = quat_rotate(turn, body.centre_of_mass.astype(turn.dtype))
+            geometry = body.shape if body.object is None else body.object
+            assert geometry is not None
+            solids.append(geometry)
+            poses.append(Pose(places.position[i] - arm, turn))
+        return distance(*solids, pose_a=poses[0], pose_b=poses[1])
 
     def joint_values(self, state: State) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
         """Coordinates q and velocities v of the joints that poses and velocities of the bodies have.

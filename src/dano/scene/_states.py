@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dano.archive import read_archive, TRAJECTORY, write_archive
 from dano.checks import shown
+from dano.maths import is_traced
 from dano.names import did_you_mean
 from dano.notebook import card, curves, numbers, plain
 
@@ -81,7 +82,7 @@ class State(eqx.Module):
 
     def __str__(self) -> str:
         """Poses and speeds of the bodies as a table."""
-        if self.names is None or self.position.ndim != 2 or isinstance(self.position, jax.core.Tracer):
+        if self.names is None or self.position.ndim != 2 or is_traced(self.position):
             return repr(self)
         rows = [
             [name, *(numbers(np.asarray(getattr(self, key)[i])) for key in STATE_SIZES)]
@@ -308,7 +309,7 @@ class Trajectory(eqx.Module):
 
     def __str__(self) -> str:
         """What notebooks show, as text."""
-        return repr(self) if isinstance(self.times, jax.core.Tracer) else plain(*self._summary())
+        return repr(self) if is_traced(self.times) else plain(*self._summary())
 
     def _repr_html_(self) -> str:
         """What notebooks show: how long, what was solved, heights over time."""
@@ -376,11 +377,10 @@ class Trajectory(eqx.Module):
         data = read_archive(path, *TRAJECTORY)
         try:
             arrays = {name: jnp.asarray(data[name]) for name in ("times", *_REPORTED)}
-            states = State(*(jnp.asarray(data[name]) for name in STATE_SIZES))
-            if "q" in data:
-                states = replace(states, **{name: jnp.asarray(data[name]) for name in JOINT_QUANTITIES})
+            keys = (*STATE_SIZES, *(JOINT_QUANTITIES if "q" in data else ()))
+            members: dict[str, Any] = {name: jnp.asarray(data[name]) for name in keys}
             names = tuple(str(name) for name in data["names"])
-            states = replace(states, names=names)
+            states = State(**members, names=names)
             source = str(data["source"]) if "source" in data else None
             return cls(states=states, names=names, **arrays), source
         except KeyError as error:
