@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from dano.checks import checked_optional, checked_text
 from dano.contact import Collider, ContactParams, SampleSet, Support, SurfaceSet
 from dano.fields import AbstractField, AbstractShape, Ellipsoid, HalfSpace, SignedDistanceGrid, Sphere
+from dano.hosted import hosted
 from dano.maths import (
     AnyArray,
     by_numpy,
@@ -243,7 +244,7 @@ class Body(eqx.Module):
         if isinstance(solid, SignedDistanceGrid):
             thickness = -float(np.min(np.asarray(solid.coefficients)))
         else:
-            thickness = 0.0 if solid is None else -float(solid.sdf(floating(middle)))
+            thickness = 0.0 if solid is None else -float(_distance(solid, floating(middle)))
         # The middle of a hollow solid is not a measure of its walls.
         thickness = thickness if thickness > 0 else 0.5 * float((upper - lower).min())
         radius = 0.5 * float(np.linalg.norm(upper - lower))
@@ -284,8 +285,9 @@ class Body(eqx.Module):
         """
         if not isinstance(self.shape, HalfSpace):
             return None
-        normal = np.asarray(quat_rotate(orientation, self.shape.normal_direction))
-        origin = np.asarray(position - quat_rotate(orientation, self.com))
+        turn = np.asarray(orientation)
+        normal = quat_rotate(turn, np.asarray(self.shape.normal_direction))
+        origin = np.asarray(position) - quat_rotate(turn, np.asarray(self.com))
         return normal, float(self.shape.offset) + float(normal @ origin)
 
 
@@ -310,6 +312,11 @@ def _checked_start(name: str, start: Mapping[str, Numbers | None]) -> dict[str, 
     if "position" in found and "origin" in found:
         raise ValueError(f"body {name!r} must start by position (centre of mass) or by origin, got both")
     return found
+
+
+@hosted
+def _distance(shape: AbstractShape, x: Float[Array, "3"]) -> Float[Array, ""]:
+    return shape.sdf(x)
 
 
 @by_numpy

@@ -228,6 +228,7 @@ def doubts_of_state(
     """
     found = []
     position, speeds = np.asarray(state.position, np.float64), np.asarray(state.velocity, np.float64)
+    spins, orientation = np.asarray(state.omega, np.float64), np.asarray(state.orientation, np.float64)
     for i in layout.free:
         body = bodies[i]
         way = float(np.linalg.norm(speeds[i])) * timestep
@@ -239,7 +240,7 @@ def doubts_of_state(
                     " velocity in m/s?",
                 )
             )
-        spin = float(np.linalg.norm(np.asarray(state.omega[i], np.float64)))
+        spin = float(np.linalg.norm(spins[i]))
         if spin * timestep > 2 * RESOLVED:
             found.append(
                 Doubt(
@@ -248,22 +249,26 @@ def doubts_of_state(
                     " is omega in rad/s?",
                 )
             )
-    turns = np.asarray(state.orientation, np.float64)[list(layout.free)]
+    turns = orientation[list(layout.free)]
     # One among others is meant so.
     if len(turns) and np.all(turns == np.array([0.0, 0.0, 0.0, 1.0])):
         names = ", ".join(repr(bodies[i].name) for i in layout.free[:3])
         text = f"orientation [0, 0, 0, 1] of {names} is a half turn about z: quaternions are wxyz"
         found.append(Doubt(4, f"{text}, and no turn is [1, 0, 0, 0]"))
     for i, body in enumerate(bodies):
-        if body.fixed and (np.any(speeds[i]) or np.any(np.asarray(state.omega[i]))):
+        if body.fixed and (np.any(speeds[i]) or np.any(spins[i])):
             found.append(Doubt(3, f"{body.name!r} is fixed: the velocity of its state moves nothing"))
     for i, j in pairs:
-        found += _begins_inside(bodies, state, position, i, j)
+        found += _begins_inside(bodies, position, orientation, i, j)
     return found
 
 
 def _begins_inside(
-    bodies: Sequence[Body], state: State, position: Float[np.ndarray, "n 3"], i: int, j: int
+    bodies: Sequence[Body],
+    position: Float[np.ndarray, "n 3"],
+    orientation: Float[np.ndarray, "n 4"],
+    i: int,
+    j: int,
 ) -> list[Doubt]:
     """Whether a body's lowest point is far below a half-space."""
     found = []
@@ -271,13 +276,13 @@ def _begins_inside(
         body, floor = bodies[k], bodies[other]
         if not isinstance(floor.shape, HalfSpace) or body.fixed or not np.isfinite(body.size):
             continue
-        plane = floor.half_space_at(state.position[other], state.orientation[other])
-        if plane is None or body.surface is None or is_traced(body.surface, plane[0], state.orientation):
+        plane = floor.half_space_at(position[other], orientation[other])
+        if plane is None or body.surface is None or is_traced(body.surface, plane[0]):
             continue
         normal, offset = plane
         points = (np.asarray(body.scale)[:, None] * np.asarray(body.surface.points)[:3]).T
-        points = points - np.asarray(body.centre_of_mass)
-        turned = np.asarray(quat_rotate(np.asarray(state.orientation[k])[None], points))
+        points = points - (np.asarray(body.com) + np.asarray(body.com_offset))
+        turned = np.asarray(quat_rotate(orientation[k][None], points))
         depth = offset - float(((position[k] + turned) @ normal).min())
         if depth > _DEEP * float(_extents(body).min()):
             text = f"{body.name!r} begins {depth:.3g} m inside {floor.name!r}: it will be pushed out"
