@@ -107,7 +107,7 @@ def test_states_and_masses_compile_nothing(cart, compilations):
     within = each(other)
     for x, y in zip(jax.tree.leaves((frames, mass, pull)), jax.tree.leaves(within), strict=True):
         np.testing.assert_allclose(x, y, atol=1e-14)
-    filled = jax.jit(scene.filled)(other)
+    filled = jax.jit(lambda x: scene.filled(x))(other)
     for x, y in zip(jax.tree.leaves(other), jax.tree.leaves(filled), strict=True):
         np.testing.assert_allclose(x, y, atol=1e-13)
 
