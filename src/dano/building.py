@@ -7,6 +7,8 @@ from dano.objects import MassModel
 
 Units = Literal["m", "cm", "mm", "in", "ft", "um"]
 
+Up = Literal["y", "z"]
+
 
 @dataclasses.dataclass(frozen=True)
 class BuildOptions:
@@ -21,6 +23,7 @@ class BuildOptions:
         mass: Total mass [kg], instead of the mass scale.
         resolution: Cells along the longest axis for mass integrals and sampling.
         units: Unit of the lengths in the file; default: as meshes say or their size tells, else metres.
+        up: Axis of a mesh's file that points up: it is turned so that z does; default: y in glTF, else z.
         length: Scale the field so that the object's longest extent is this [m].
         floaters: Parts that are separate from the largest one feel contact, too; those of meshes always do.
         seed: Seed of the random samples.
@@ -33,6 +36,13 @@ class BuildOptions:
     mass: float | None = None
     resolution: int = 96
     units: Units | None = None
+    up: Up | None = None
     length: float | None = None
     floaters: bool = False
     seed: int = 0
+
+    @property
+    def of_file(self) -> dict[str, str]:
+        """Those that count where the file is read, as options of `load_field`."""
+        given = {"units": self.units, "up": self.up}
+        return {name: value for name, value in given.items() if value is not None}

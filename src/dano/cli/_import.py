@@ -82,6 +82,7 @@ def _of_format(command: Import) -> dict[str, Any]:
         "signed_distance": command.signed_distance or None,
         "grid": command.grid,
         "cascade": command.cascade,
+        "up": command.up,
         "module": command.module,
         "skip_nan": command.skip_nan or None,
         "undo_transform": False if command.keep_transform else None,

@@ -97,7 +97,14 @@ def identify(
     setup = Setup(space, scene, controls, chosen, sigmas, options, checked_engine(engine))
     check_scales(scene, motions, options.window, state if isinstance(state, State) else None)
     kept = _kept(setup, motions, state, after)
-    found = _fitted(setup, motions, _motions("held_out", held_out, scene), state, after, kept, progress)
+    held = _motions("held_out", held_out, scene)
+    try:
+        found = _fitted(setup, motions, held, state, after, kept, progress)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            "observed must be motions that the scene can follow, got some from which the simulation ends in"
+            " numbers that are none: check their frame and units, the initial state and the bounds"
+        ) from error
     for message in found.messages:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
     return found
@@ -358,12 +365,47 @@ def _missed(scene: Scene, motions: Sequence[Motion], errors: Errors) -> str | No
     sizes = [scene.body(name).size for m in motions for name in m.names]
     largest = max([size for size in sizes if np.isfinite(size)], default=np.inf)
     if not errors.mean_position > largest:
-        return None
+        noise, way = _noise(motions), _way(motions)
+        if not errors.mean_position > max(_FAR_OFF * noise, _OFF_WAY * way) > 0:
+            return None
+        return (
+            f"the fit misses the observed positions by {1e3 * errors.mean_position:.3g} mm on average, and"
+            f" they scatter by {1e3 * noise:.2g} mm: the scene does not move as observed; check frames (is z"
+            " up?), units, what touches and the initial state"
+        )
     return (
         f"the fit misses the observed positions by {errors.mean_position:.3g} m on average, more than the"
         f" bodies are long ({largest:.3g} m): what was found does not move as observed; check units, frames"
         " and the initial state, or try more starts"
     )
+
+
+_FAR_OFF, _OFF_WAY = 10.0, 0.03
+"""A fit that is off by more than so many times the noise and such a share of the way is of another scene."""
+
+
+def _noise(motions: Sequence[Motion]) -> float:
+    """Standard deviation of positions from frame to frame [m], from their second differences."""
+    found = []
+    for motion in motions:
+        second = np.diff(motion.position, 2, axis=0)
+        sizes = np.abs(second[np.isfinite(second)])
+        if sizes.size:
+            # 1.4826 times the median is that of normal numbers; 1, −2 and 1 add up to a variance of 6.
+            found.append(1.4826 * float(np.median(sizes)) / np.sqrt(6.0))
+    return max(found, default=0.0)
+
+
+def _way(motions: Sequence[Motion]) -> float:
+    """How far the observed bodies went [m], the longest way."""
+    ways = [0.0]
+    for motion in motions:
+        for body in range(motion.position.shape[1]):
+            seen = motion.position[:, body]
+            seen = seen[np.isfinite(seen).all(axis=-1)]
+            if len(seen):
+                ways.append(float(np.linalg.norm(np.ptp(seen, axis=0))))
+    return max(ways)
 
 
 def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene: Scene) -> tuple[Motion, ...]:

@@ -1,14 +1,15 @@
 """Whether motions can be in metres and seconds, asked before hours of simulation."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from dano.identification.motions import Motion
-from dano.maths import quat_to_matrix
-from dano.scene import Scene, State
+from dano.maths import quat_multiply, quat_rotate, quat_to_matrix
+from dano.scene import Body, Scene, State
 
 _FASTEST = 340.0
 """Speed [m/s] that bodies stay below which fall, slide and are thrown: that of sound."""
@@ -96,19 +97,21 @@ def _check_positions(name: str, times: np.ndarray, places: np.ndarray, size: flo
 
 
 def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -> None:
-    """Whether a body that planes may carry seems to lie in them, or to float."""
+    """Whether a body that planes may carry seems to lie in them, to float, or to be seen in another frame."""
     name = motion.names[row]
     body = scene.body(name)
-    if motion.orientation is None or body.surface is None or body.surface.turning != "fixed":
+    if body.surface is None or body.surface.turning != "fixed":
         return
-    poses = np.concatenate([motion.position[:, row], motion.orientation[:, row]], axis=1)
-    known = np.isfinite(poses).all(axis=1)
+    places = motion.position[:, row]
+    turns = np.where(np.isfinite(motion.orientation[:, row]), motion.orientation[:, row], _UNTURNED)
+    known = np.isfinite(places).all(axis=1)
     if known.sum() < 2:
         return
+    seen = _Seen(places[known], turns[known], motion.point == "origin")
     planes = {a if b == name else b for a, b in scene.pairs if name in (a, b)}
     for other in sorted(planes):
         plane = scene.body(other)
-        pose = plane.com, jnp.array([1.0, 0.0, 0.0, 0.0])
+        pose = plane.com, jnp.array(_UNTURNED)
         if state is not None:
             i = scene.index(other)
             pose = state.position[i], state.orientation[i]
@@ -116,24 +119,76 @@ def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -
         if not plane.fixed or there is None:
             continue
         normal, offset = there
-        gaps = _gaps(body, motion, row, known, normal, offset)
+        gaps = _gaps(body, seen, normal, offset)
+        if _lies(gaps, body.size):
+            continue
+        better = [
+            words
+            for words, other_frame in _FRAMES.items()
+            if _lies(_gaps(body, other_frame(seen), normal, offset), body.size)
+        ]
         text = _beside(gaps, motion.times[known], body.size)
-        if text:
+        if better:
             warnings.warn(
-                f"{name!r} seems to lie {1e3 * abs(np.median(gaps)):.3g} mm {text} {other!r}: focal length,"
-                " place of the camera or scale of the film do not fit the scene, or the scene's plane lies"
-                " elsewhere",
+                f"{name!r} does not move along {other!r} as it is, but does {better[0]}: is the motion in"
+                " another frame?",
+                stacklevel=5,
+            )
+        elif text:
+            away = -float(np.median(gaps)) * normal
+            shift = ", ".join(f"{x:.3g}" for x in away)
+            warnings.warn(
+                f"{name!r} seems to lie {1e3 * abs(np.median(gaps)):.3g} mm {text} {other!r}: moved by"
+                f" ({shift}) m it would lie on it; frame of the log, focal length, place of the camera or scale"
+                " of the film do not fit the scene, or the scene's plane lies elsewhere",
                 stacklevel=5,
             )
 
 
-def _gaps(body, motion: Motion, row: int, known, normal: np.ndarray, offset: float) -> np.ndarray:
-    """Distance of a body's lowest point from a plane in each known frame [m]."""
+class _Seen(NamedTuple):
+    """Poses of a body: places [m], turns wxyz, and whether places are those of its field frame."""
+
+    places: np.ndarray
+    turns: np.ndarray
+    of_origin: bool
+
+
+_UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+_Y_UP = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_UPSIDE_DOWN = np.array([0.0, 1.0, 0.0, 0.0])
+
+
+def _turned_by(turn: np.ndarray) -> Callable[[_Seen], _Seen]:
+    """Poses in a world that is turned."""
+
+    def turned(seen: _Seen) -> _Seen:
+        places = np.asarray(quat_rotate(turn[None], seen.places))
+        return seen._replace(places=places, turns=np.asarray(quat_multiply(turn[None], seen.turns)))
+
+    return turned
+
+
+_FRAMES: dict[str, Callable[[_Seen], _Seen]] = {
+    "with y as the axis that is up, (x, −z, y)": _turned_by(_Y_UP),
+    "upside down, (x, −y, −z)": _turned_by(_UPSIDE_DOWN),
+    "with quaternions read as xyzw": lambda seen: seen._replace(turns=np.roll(seen.turns, 1, axis=1)),
+}
+"""Frames in which others keep motions, in words, and how they are brought into ours."""
+
+
+def _gaps(body: Body, seen: _Seen, normal: np.ndarray, offset: float) -> np.ndarray:
+    """Distance of a body's lowest point from a plane in each frame [m]."""
+    assert body.surface is not None
     points = np.asarray(body.surface.points[:3])
-    turned = np.asarray(quat_to_matrix(motion.orientation[known, row]))
-    arm = np.zeros(3) if motion.point == "origin" else np.asarray(body.centre_of_mass)
+    turned = np.asarray(quat_to_matrix(seen.turns))
+    arm = np.zeros(3) if seen.of_origin else np.asarray(body.centre_of_mass)
     lowest = (np.einsum("tij,i->tj", turned, normal) @ (points - arm[:, None])).min(axis=1)
-    return motion.position[known, row] @ normal - offset + lowest
+    return seen.places @ normal - offset + lowest
+
+
+def _lies(gaps: np.ndarray, size: float) -> bool:
+    """Whether a body lies on a plane, most of the time."""
+    return float(np.median(np.abs(gaps))) <= _BESIDE * size
 
 
 def _beside(gaps: np.ndarray, times: np.ndarray, size: float) -> str:

@@ -24,6 +24,8 @@ _WIDEST = 0.05
 _LAST, _LEAST = 0.5, 1e-3
 # Distance to the minimum of the trend, and scatter by ripples, that do not matter [standard errors].
 _STEADY = 0.5
+# Share of the widest draws that counts as a standard error where that is less: 5e-4 of a parameter's range.
+_FINE = 0.01
 # Derivatives are blind to a parameter if their curvature is so small a share of that of planes.
 _LITTLE = 1e-2
 # Shares of the frames that count, one after the other, and most steps at each.
@@ -412,8 +414,10 @@ def _seen(problem: Smoothed, point: _Point) -> _Sight:
     errors = np.where(errors > 0, errors, np.inf)
     to = np.clip(point.x - inverse @ gradient, problem.lower, problem.upper)
     scatter = np.sqrt(np.mean(_displacements(problem, found) ** 2, axis=0))
-    away = float(np.max(np.abs(to - point.x) / errors, initial=0))
-    return _Sight(found, normal, errors, away, float(np.max(scatter / errors, initial=0)))
+    # Of data without noise standard errors are nothing; what moves a value by less than this matters to none.
+    scale = np.maximum(errors, _FINE * _ranges(problem, point.x))
+    away = float(np.max(np.abs(to - point.x) / scale, initial=0))
+    return _Sight(found, normal, errors, away, float(np.max(scatter / scale, initial=0)))
 
 
 def _variance(problem: Smoothed, normal: NormalEquations) -> float:

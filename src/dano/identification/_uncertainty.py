@@ -15,6 +15,8 @@ from dano.solvers import eliminated, NormalEquations
 _FLAT = 1e-10
 # Share of the bounds, or of the value, that may be uncertain.
 _OPEN = 0.5
+# Standard error, in what the bounds allow or else in values, from which a parameter was not observed at all.
+_UNSEEN = 10.0
 # Share of a combination that a parameter must have to be named.
 _TAKES_PART = 0.25
 _MASSES = (".mass", ".mass_scale", ".inertia")
@@ -123,6 +125,9 @@ def _inverse(space: Space, x, hessian, variance: float, free, scene: Scene, free
         lost = np.abs(vectors[:, k]) > 1e-3
         covariance[lost, lost] = np.inf
     errors = np.sqrt(np.diag(covariance))
+    for k in np.flatnonzero(np.isfinite(errors) & (errors > _UNSEEN)):
+        messages.append(f"{space.labels[free[k]]} was not observed: nothing in the data depends on its value")
+        covariance[k, k] = errors[k] = np.inf
     logarithms = [log for s in space.selections for log in [s.coordinates == "log"] * s.size]
     for k in np.flatnonzero(np.isfinite(errors)):
         i = int(free[k])

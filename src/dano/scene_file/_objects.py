@@ -115,7 +115,7 @@ def _built_of(
     def build() -> Built:
         field = load_field(
             source if isinstance(source, str) else Path(source),
-            units=None if options is None else options.units,
+            **({} if options is None else options.of_file),
         )
         chosen = _usual(isinstance(field, AbstractShape)) if options is None else options
         return _made(field, chosen, dashes, progress)

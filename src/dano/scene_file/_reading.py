@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, cast, get_args, TYPE_CHECKING
 
 from dano.archive import checked_input
-from dano.building import BuildOptions, Units
+from dano.building import BuildOptions, Units, Up
 from dano.checks import checked_choice, checked_count, checked_number, shown
 from dano.contact import AbstractContactLaw, CentroidLaw, ContactParams, DistributedLaw
 from dano.engine import simulate
@@ -386,6 +386,7 @@ def _build_options(build: Table) -> BuildOptions:
         mass_scale=build.number("mass_scale") if "mass_scale" in build else None,
         resolution=build.integer("resolution", usual.resolution),
         units=cast(Units, build.word("units", get_args(Units))) if "units" in build else None,
+        up=cast(Up, build.word("up", get_args(Up))) if "up" in build else None,
         length=build.number("length") if "length" in build else None,
         floaters=build.boolean("floaters", usual.floaters),
         seed=build.integer("seed", usual.seed),

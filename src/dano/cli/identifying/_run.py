@@ -194,7 +194,12 @@ def _print(fit: Identification) -> None:
     for name, value in fit.values.items():
         if np.ndim(value) == 0:
             low, high = fit.interval(name)
-            put(f"{name:<32.32} {value:12.6g} {fit.standard_errors[name]:15.3g}    {low:.6g} … {high:.6g}")
+            error = float(fit.standard_errors[name])
+            if not np.isfinite(error):
+                why = "at its bound" if np.isnan(error) else "not observed"
+                put(f"{name:<32.32} {value:12.6g} {why:>15}")
+                continue
+            put(f"{name:<32.32} {value:12.6g} {error:15.3g}    {low:.6g} … {high:.6g}")
         else:
             put(f"{name:<32.32} {np.array2string(np.asarray(value), precision=5).replace(chr(10), ' ')}")
             errors = np.asarray(fit.standard_errors[name])

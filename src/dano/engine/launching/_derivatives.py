@@ -109,7 +109,9 @@ def _(*inputs, plan, batched, n_worlds, which, differs, n_directions):
 
 @tangent_p.def_impl
 def _(*inputs, **parameters):
-    return jax.jit(lambda *given: tangent_p.bind(*given, **parameters))(*inputs)
+    # A launch is compiled whatever `jax_disable_jit` says: it is one operation, with nothing in it to look at.
+    with jax.disable_jit(False):
+        return jax.jit(lambda *given: tangent_p.bind(*given, **parameters))(*inputs)
 
 
 def _changed(plan: Plan) -> dict[str, Shape]:

@@ -54,7 +54,9 @@ def _(*inputs, plan, batched, n_worlds):
 def _(*inputs, **parameters):
     if all(device.platform == "cpu" for x in inputs for device in x.devices()):
         return _cpu.launched(inputs=inputs, **parameters)
-    return _program(**parameters)(*inputs)
+    # Compiled whatever `jax_disable_jit` says: it is one operation, with nothing to look at.
+    with jax.disable_jit(False):
+        return _program(**parameters)(*inputs)
 
 
 @functools.lru_cache(maxsize=256)

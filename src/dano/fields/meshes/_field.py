@@ -67,6 +67,7 @@ def mesh_field(
     edge: float | None = None,
     scale: int | float | None = None,
     units: str | None = None,
+    up: str | None = None,
 ) -> SignedDistanceGrid:
     """The solid inside a triangle mesh, as a sampled signed distance.
 
@@ -91,6 +92,8 @@ def mesh_field(
         scale: Metres in the unit of the mesh. Default: as the file says, else metres; files without units
             that would be longer than 20 m are read in millimetres, which a UserWarning says.
         units: The same by name: "m", "cm", "mm", "in", "ft" or "um".
+        up: Which axis of the file points up, "y" or "z": it is turned so that z does. Default: y in glTF,
+            which a UserWarning says, else z.
 
     Returns:
         A shape in the frame of the mesh, with the volume moments of the mesh in closed form unless it
@@ -106,7 +109,7 @@ def mesh_field(
         resolution = checked_count("resolution", resolution, least=8, most=512)
     if edge is not None:
         checked_number("edge", edge, least=0)
-    raw = read_mesh(mesh, checked_units(scale, units))
+    raw = read_mesh(mesh, checked_units(scale, units), up)
     name, notes = raw.name, []
     try:
         closed = repaired(raw.vertices, raw.faces, DISTANCES.load())

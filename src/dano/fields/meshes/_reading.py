@@ -26,6 +26,17 @@ _LONGEST = 20.0
 """Longest extent up to which files without units are read in metres: a lorry; 20 mm is a small part."""
 
 
+AXES = {"z": np.eye(3), "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
+"""What turns files so that z points up, by the axis that does in them."""
+
+_Y_UP = (".glb", ".gltf")
+"""Formats whose y points up (glTF 2.0, section 3.4)."""
+_NO_AXES = (".obj", ".stl", ".ply", ".off")
+"""Formats that say nothing of axes."""
+_FLAT, _STANDS = 1e-4, 0.2
+"""How far vertices of a flat side may be off it, in sizes; share of a side of the box that is enough."""
+
+
 class RawMesh(NamedTuple):
     """A mesh as its file has it, in metres.
 
@@ -54,13 +65,17 @@ def checked_units(scale: int | float | None, units: str | None) -> float | None:
     return None if scale is None else checked_number("scale", scale, above=0)
 
 
-def read_mesh(mesh: "str | Path | trimesh.Trimesh | trimesh.Scene", factor: float | None) -> RawMesh:
+def read_mesh(
+    mesh: "str | Path | trimesh.Trimesh | trimesh.Scene", factor: float | None, up: str | None = None
+) -> RawMesh:
     """A mesh from a file, or from an object of trimesh.
 
     Args:
         mesh: The file, or the object.
         factor: Metres in its unit. None: as the file says; else metres, unless it would be larger than a
             vehicle, which a UserWarning says.
+        up: Which of its axes points up, "y" or "z"; it is turned so that z does. None: as the file says, so
+            that glTF is turned, which a UserWarning says; one that lies on a flat side along y is asked for.
 
     Raises:
         ValueError: If it cannot be read, holds no faces, or has vertices that are not finite.
@@ -89,7 +104,46 @@ def read_mesh(mesh: "str | Path | trimesh.Trimesh | trimesh.Scene", factor: floa
         factor = (
             _told(stated) if stated else 1.0 if own else _guessed(name, float(np.ptp(used, axis=0).max()))
         )
-    return RawMesh(name, factor * vertices, faces)
+    if up is not None:
+        checked_choice("up", up, list(AXES))
+    elif not own:
+        up = _upward(name, vertices, faces)
+    return RawMesh(name, factor * (vertices if up is None else vertices @ AXES[up].T), faces)
+
+
+def _upward(name: str, vertices: np.ndarray, faces: np.ndarray) -> str | None:
+    """The axis that points up by the format of a file; None where that says nothing."""
+    if Path(name).suffix.lower() in _Y_UP:
+        warnings.warn(
+            f"{name}: y is up in glTF: it is turned so that z is; up='z' (--up z) leaves it as it is",
+            UserWarning,
+            stacklevel=4,
+        )
+        return "y"
+    if Path(name).suffix.lower() in _NO_AXES and _stands_along_y(vertices, faces):
+        warnings.warn(
+            f"{name}: its only flat side faces −y: if y is up there, up='y' (--up y) turns it; up='z' leaves"
+            " it as it is",
+            UserWarning,
+            stacklevel=4,
+        )
+    return None
+
+
+def _stands_along_y(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether a mesh has one flat side on a box around it, below along y: it was drawn standing on that."""
+    corners = vertices[faces]
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    size = high - low
+    normals = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat = np.zeros((3, 2))
+    for axis in range(3):
+        whole = np.prod(np.delete(size, axis))
+        for side, end in enumerate((low, high)):
+            lies = np.all(np.abs(corners[:, :, axis] - end[axis]) < _FLAT * size.max(), axis=1)
+            flat[axis, side] = np.abs(normals[lies, axis]).sum() / max(whole, 1e-300)
+    others = np.delete(flat.ravel(), 2)
+    return bool(flat[1, 0] > _STANDS and others.max() < 0.1 * _STANDS)
 
 
 def _loaded(path: Path) -> Any:

@@ -55,7 +55,7 @@ _CHECKPOINT = (
     "log2_hashmap_size",
     "disable_scene_contraction",
 )
-_MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge"))
+_MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge", "up"))
 _SPLATS = _Reader(load_splats, ("min_width", "skip_nan"), crops=True)
 _READERS: dict[str, _Reader] = {
     ".npz": _Reader(load_npz, ("interpolation",)),
