@@ -139,8 +139,8 @@ def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -
             shift = ", ".join(f"{x:.3g}" for x in away)
             warnings.warn(
                 f"{name!r} seems to lie {1e3 * abs(np.median(gaps)):.3g} mm {text} {other!r}: moved by"
-                f" ({shift}) m it would lie on it; frame of the log, focal length, place of the camera or scale"
-                " of the film do not fit the scene, or the scene's plane lies elsewhere",
+                f" ({shift}) m it would lie on it; frame of the log, focal length, place of the camera or"
+                " scale of the film do not fit the scene, or the scene's plane lies elsewhere",
                 stacklevel=5,
             )
 

@@ -109,7 +109,7 @@ def _(*inputs, plan, batched, n_worlds, which, differs, n_directions):
 
 @tangent_p.def_impl
 def _(*inputs, **parameters):
-    # A launch is compiled whatever `jax_disable_jit` says: it is one operation, with nothing in it to look at.
+    # A launch is compiled whatever `jax_disable_jit` says: one operation, with nothing to look at.
     with jax.disable_jit(False):
         return jax.jit(lambda *given: tangent_p.bind(*given, **parameters))(*inputs)
 
