@@ -205,7 +205,8 @@ WITH_OTHERS = {
         actuator_forcelimited key_qvel opt""",
     "refused with it": """geom_fluid geom_plugin body_plugin actuator_plugin actuator_actlimited
         actuator_actrange actuator_actearly actuator_dynprm actuator_cranklength actuator_lengthrange
-        actuator_dampingpoly jnt_springyield tendon_actfrclimited tendon_actfrcrange tendon_range tendon_lengthspring tendon_margin
+        actuator_dampingpoly jnt_springyield tendon_actfrclimited tendon_actfrcrange tendon_range
+        tendon_lengthspring tendon_margin
         tendon_type tendon_dampingpoly tendon_stiffnesspoly tendon_springyield tendon_solimp_fri
         tendon_solimp_lim tendon_solref_fri tendon_solref_lim wrap_objid wrap_prm wrap_type""",
     "said with contacts": "geom_solmix",

@@ -23,8 +23,8 @@ from dano.scene._states import State
 
 MOST_SAID = 3
 """Doubts of one thing that are said at once, the worst first."""
-LIGHTEST, HEAVIEST = 1.0, 25e3
-"""Densities [kg/m³] between those of air (1.2) and osmium (22,600), which no body exceeds."""
+LIGHTEST, HEAVIEST = 0.1, 25e3
+"""Densities [kg/m³] of a tenth of air (1.2), a metre of a kilogram, and of osmium (22,600) and a little more."""
 _LONGEST = 20.0
 """Size [m] of a body that moves, from which it is rather in millimetres."""
 _THINNEST = 1e-4
