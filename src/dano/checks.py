@@ -117,7 +117,9 @@ def checked_count(name: str, value: object, least: int = 1, most: int | None = N
     try:
         count = operator.index(value)  # pyright: ignore[reportArgumentType]
     except TypeError:
-        raise ValueError(f"{name} must be a whole number, got {shown(value)}") from None
+        count = None
+    if count is None or isinstance(value, bool):
+        raise ValueError(f"{name} must be a whole number, got {shown(value)}")
     if count < least or (most is not None and count > most):
         valid = f"be ≥ {least}" if most is None else f"lie between {least} and {most}"
         raise ValueError(f"{name} must {valid}, got {count}")

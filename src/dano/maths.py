@@ -487,7 +487,7 @@ def checked_floating(name: str, value: Numbers) -> Array:
     """
     try:
         # NumPy would drop an imaginary part with a warning, and reads no tracers, alone or in a tuple.
-        real = is_traced(value) or not np.iscomplexobj(value)
+        real = is_traced(value) or not (isinstance(value, bool) or np.iscomplexobj(value))
         array = floating(value) if real else None
     except (TypeError, ValueError, OverflowError):
         array = None

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -138,3 +139,50 @@ def test_friction_between_bodies_of_the_file(framed):
     doubts = "\n".join(robot_doubts(read_robot(framed)))
     assert "not read: solref or solimp of 'geom 2'" in doubts
     assert "not read: torsional and rolling friction of 'geom 3'" in doubts
+
+
+GRIPPER = """<mujoco><compiler angle="radian"/><worldbody><body name="hand" pos="0 0 1">
+<geom type="box" size=".05 .05 .02" mass="1"/>
+<body name="left" pos="0 .02 .05"><joint name="l" type="slide" axis="0 1 0" damping="2"/>
+ <geom type="box" size=".01 .01 .04" mass=".1"/></body>
+<body name="right" pos="0 -.02 .05"><joint name="r" type="slide" axis="0 -1 0" damping="1"/>
+ <geom type="box" size=".01 .01 .04" mass=".2"/></body></body></worldbody>
+<tendon><fixed name="split"><joint joint="l" coef=".5"/><joint joint="r" coef=".5"/></fixed></tendon>
+<equality><joint joint1="r" joint2="l" polycoef="0 {ratio}" solref=".002 1" solimp=".999 .9999"/></equality>
+<actuator>{actuator}</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.5])
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<motor name="m" tendon="split" gear="3"/>',
+        '<position name="m" tendon="split" kp="50" kv="4"/>',
+        '<motor name="m" joint="r" gear="2"/>',
+    ],
+)
+def test_drives_of_tendons_and_of_joints_that_follow(tmp_path, actuator: str, ratio: float):
+    """A gripper, beside MuJoCo, whose equality is nearly hard."""
+    path = tmp_path / "gripper.xml"
+    path.write_text(GRIPPER.format(actuator=actuator, ratio=ratio), encoding="utf-8")
+    robot, model = dano.load_mjcf(path, collision=False), mujoco.MjModel.from_xml_path(str(path))
+    model.opt.timestep = 2e-4
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 0.02
+    mujoco.mj_step(model, data, 500)
+    scene = robot.scene(timestep=2e-4)
+    control = robot.control(scene, dict(m=0.02))
+    repeated = jax.tree.map(lambda x: jnp.repeat(x[None], 500, axis=0), control)
+    q = float(dano.simulate(scene, robot.state(scene), controls=repeated).states.q[-1, 0])
+    assert q == pytest.approx(float(data.joint("l").qpos[0]), rel=0.02)
+    assert abs(q) > 1e-4
+
+
+def test_a_tendon_of_free_joints_is_refused(tmp_path):
+    path = tmp_path / "gripper.xml"
+    text = GRIPPER.format(actuator='<motor name="m" tendon="split"/>', ratio=1.0)
+    path.write_text(text.replace("<equality>", "<!--").replace("</equality>", "-->"), encoding="utf-8")
+    with pytest.raises(
+        ValueError, match=r"several joints, of which none leads .* ignore=\['other actuators'\]"
+    ):
+        dano.load_mjcf(path, collision=False)

@@ -80,6 +80,21 @@ def test_the_three_worst_are_said_and_how_many_more():
     assert "less than air" in lines[0] and "more: `dano check` lists them" in lines[2]
 
 
+def test_bodies_that_nobody_placed_are_not_judged():
+    """A state to be changed later begins with all bodies at the origin."""
+    ball, floor = (
+        dano.Body("ball", dano.Sphere(0.1), mass=1.0),
+        dano.Body("floor", dano.HalfSpace(), fixed=True),
+    )
+    scene = dano.Scene.create([ball, floor])
+    assert said_of(lambda: scene.initial_state(ball=dict(velocity=(1, 0, 0)))) == []
+    assert said_of(lambda: scene.initial_state(ball=dict(position=(0, 0, 0.1)))) == []
+    assert len(said_of(lambda: scene.initial_state(ball=dict(position=(0, 0, 0))))) == 1
+    assert "is fixed" in said_of(lambda: scene.initial_state(floor=dict(velocity=(1, 0, 0))))[0]
+    with pytest.raises(ValueError, match="got 'floor', which is fixed"):
+        scene.control(floor=dict(force=(1, 0, 0)))
+
+
 def test_python_says_it_when_it_is_made():
     heavy = dano.Body("soap", dano.Box((0.045, 0.03, 0.02)), mass=150.0)
     with pytest.warns(SceneWarning, match="more than any metal"):

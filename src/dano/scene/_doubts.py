@@ -30,6 +30,8 @@ _LONGEST = 20.0
 _THINNEST = 1e-4
 """Share of its size below which a body is thinner than its samples can tell."""
 _NO_LENGTHS = ("normal", "offset", "rounding")
+_STRONGEST = 100.0
+"""Gravity [m/s²] beyond that of all planets, and of centrifuges for people."""
 _FAR = 3.0
 """Sizes from a body's middle at which an anchor is rather given in another frame."""
 _TURNS = 10.0
@@ -94,6 +96,9 @@ def doubts_of_scene(
     for joint in joints:
         if not is_traced(joint):
             found += _of_joint(joint, by_name)
+    if not is_traced(gravity) and float(np.linalg.norm(np.asarray(gravity))) > _STRONGEST:
+        strength = float(np.linalg.norm(np.asarray(gravity)))
+        found.append(Doubt(1, f"gravity is {strength:.4g} m/s²: that of the earth is 9.81"))
     if not is_traced(gravity) and float(gravity[2]) > 0 and float(abs(gravity[:2]).max()) == 0:
         found.append(Doubt(1, f"gravity points up, {float(gravity[2]):.3g} m/s² along z: z is up"))
     return found
@@ -251,6 +256,9 @@ def doubts_of_state(
                     " wxyz, and no turn is [1, 0, 0, 0]",
                 )
             )
+    for i, body in enumerate(bodies):
+        if body.fixed and (np.any(speeds[i]) or np.any(np.asarray(state.omega[i]))):
+            found.append(Doubt(3, f"{body.name!r} is fixed: the velocity of its state moves nothing"))
     for i, j in pairs:
         found += _begins_inside(bodies, state, position, i, j)
     return found

@@ -380,20 +380,23 @@ class Scene(eqx.Module):
             state = self.filled(dataclasses.replace(state, **of_joints))
         self.check_state(state)
         warn_of_limits(self.layout, self.joints, state.q, self.timestep, joint_names or {})
-        say_doubts(self._doubts_of(state), stacklevel=3)
+        placed = [name for name, given in bodies.items() if {"position", "origin", "q"} & set(given)]
+        say_doubts(self._doubts_of(state, placed), stacklevel=3)
         return state
 
     def doubts(self, state: State) -> list[Doubt]:
         """What is odd about the scene and a state: units, frames, slips; none where numbers are traced."""
         return [
             *doubts_of_scene(self.bodies, self.joints, self.contacts, self.gravity),
-            *self._doubts_of(state),
+            *self._doubts_of(state, self.names),
         ]
 
-    def _doubts_of(self, state: State) -> list[Doubt]:
+    def _doubts_of(self, state: State, placed: Sequence[str]) -> list[Doubt]:
+        """Of a state; `placed`: bodies of which somebody said where they are."""
         if is_traced(state, self.timestep):
             return []
-        return doubts_of_state(self.bodies, self.point_pairs, self.layout, state, float(self.timestep))
+        pairs = [pair for pair in self.point_pairs if {self.names[i] for i in pair} & set(placed)]
+        return doubts_of_state(self.bodies, pairs, self.layout, state, float(self.timestep))
 
     def filled(self, state: State) -> State:
         """The state with the rows of bodies on joints as `q` and `v` say; for one state.
@@ -485,7 +488,8 @@ class Scene(eqx.Module):
         """
         given, dtype = merged("controls", controls, bodies), self.timestep.dtype
         for name in given:
-            self.index(name)
+            if self.body(name).fixed and given[name]:
+                raise ValueError(f"control must be of a body that moves, got {name!r}, which is fixed")
         of_joints: dict[str, Array] = {}
         if self.joints:
             keys = ("effort", "command") if self.driven else ("effort",)

@@ -1,6 +1,6 @@
 """Actuators of MuJoCo's files as drives of joints, where a motor of dano does the same."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,23 +10,37 @@ ALL, OTHER = "actuators", "other actuators"
 """Names by which all of them are left out, or those that dano has no counterpart of."""
 
 
-def drives_of(model: Any, mujoco: Any) -> tuple[dict[int, Drive], list[Lacking]]:
-    """The drives by the index of their joint, and what no motor does.
+class Pull(NamedTuple):
+    """A drive of several joints: its length is the sum of their coordinates by their shares.
+
+    Attributes:
+        drive: The drive.
+        shares: By the indices of the joints.
+    """
+
+    drive: Drive
+    shares: dict[int, float]
+
+
+def drives_of(model: Any, mujoco: Any) -> tuple[dict[int, Drive], list[Pull], list[Lacking]]:
+    """The drives by the index of their joint, those of fixed tendons, and what no motor does.
 
     MuJoCo's force is gain · u + bias, with constant, place and speed in the bias (its documentation,
     "Force generation"); `dano.Motor` has those of a motor, and of servos that hold a place or a speed.
     """
     found: dict[int, Drive] = {}
+    pulls: list[Pull] = []
     lacking: list[Lacking] = []
     if _disabled(model, mujoco, "mjDSBL_ACTUATION"):
-        return found, lacking
+        return found, pulls, lacking
     for i in range(model.nactuator if hasattr(model, "nactuator") else model.nu):
         name = model.actuator(i).name or f"actuator {i}"
         if int(model.opt.disableactuator) >> int(model.actuator_group[i]) & 1:
             continue
         joint = int(model.actuator_trnid[i][0])
+        shares = _shares(model, mujoco, i)
         why = _unlike(model, mujoco, i)
-        if why is None and joint in found:
+        if why is None and shares is None and joint in found:
             why = f"drives joint {model.joint(joint).name!r}, which {found[joint].name!r} drives already"
         if why is not None:
             lacking.append(Lacking(OTHER, f"actuator {name!r} {why}, which dano has no motor for"))
@@ -34,9 +48,23 @@ def drives_of(model: Any, mujoco: Any) -> tuple[dict[int, Drive], list[Lacking]]
         drive = _drive(model, mujoco, i, name)
         if isinstance(drive, str):
             lacking.append(Lacking(OTHER, f"actuator {name!r} {drive}, which dano has no motor for"))
+        elif drive is not None and shares is not None:
+            pulls.append(Pull(drive, shares))
         elif drive is not None:
             found[joint] = drive
-    return found, lacking
+    return found, pulls, lacking
+
+
+def _shares(model: Any, mujoco: Any, i: int) -> dict[int, float] | None:
+    """Shares of joints in the length of a fixed tendon that an actuator pulls; None for none."""
+    if int(model.actuator_trntype[i]) != int(mujoco.mjtTrn.mjTRN_TENDON):
+        return None
+    tendon = int(model.actuator_trnid[i][0])
+    first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
+    rows = range(first, first + count)
+    if any(int(model.wrap_type[k]) != int(mujoco.mjtWrap.mjWRAP_JOINT) for k in rows):
+        return None
+    return {int(model.wrap_objid[k]): float(model.wrap_prm[k]) for k in rows}
 
 
 def _disabled(model: Any, mujoco: Any, flag: str) -> bool:
@@ -46,10 +74,12 @@ def _disabled(model: Any, mujoco: Any, flag: str) -> bool:
 def _unlike(model: Any, mujoco: Any, i: int) -> str | None:
     """Why an actuator is not a motor of one joint; None if it is."""
     joints = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
-    if int(model.actuator_trntype[i]) not in map(int, joints):
-        return "acts on no joint, but on a tendon, a site or a body"
+    shares = _shares(model, mujoco, i)
+    if shares is None and int(model.actuator_trntype[i]) not in map(int, joints):
+        return "acts on no joint, but on a tendon of sites, a site or a body"
     kinds = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
-    if int(model.jnt_type[int(model.actuator_trnid[i][0])]) not in map(int, kinds):
+    moved = [int(model.actuator_trnid[i][0])] if shares is None else list(shares)
+    if any(int(model.jnt_type[j]) not in map(int, kinds) for j in moved):
         return "acts on a ball or a free joint"
     if int(model.actuator_dyntype[i]) != int(mujoco.mjtDyn.mjDYN_NONE):
         return "has a state of its own (a filter, an integrator, a muscle)"

@@ -315,6 +315,16 @@ def at_home(joint: Connection) -> Placed:
     return displaced(joint, joint.home) if joint.home else joint.place
 
 
+def led_by(joints: list[Connection], name: str) -> tuple[str, float, float]:
+    """The joint that one follows, through others that follow, too, with ratio and shift; itself if none."""
+    named = {joint.name: joint for joint in joints}
+    ratio, shift = 1.0, 0.0
+    while (mimics := named[name].mimics) is not None:
+        name, times, plus = mimics
+        ratio, shift = ratio * times, ratio * plus + shift
+    return name, ratio, shift
+
+
 def held_at(joint: Connection, q: float) -> Connection:
     """A hinge or a slide that stays at a coordinate [rad or m]: a weld."""
     return Connection(joint.name, "weld", joint.parent, joint.child, displaced(joint, q))

@@ -9,13 +9,14 @@ import numpy as np
 
 from dano.extras import optional
 from dano.maths import quat_conjugate, quat_multiply
-from dano.robots.formats._actuators import drives_of, OTHER
+from dano.robots.formats._actuators import drives_of, OTHER, Pull
 from dano.robots.formats._description import (
     Connection,
     Description,
     displaced,
     held_at,
     Lacking,
+    led_by,
     Link,
     Placed,
     Solid,
@@ -27,6 +28,8 @@ from dano.robots.formats._lacking import EQUALITIES, lacking_of, notes_of, silen
 from dano.robots.formats._touching import meets_of, touching_geoms
 
 _WORLD = "world"
+_SHIFTED = 1e-9
+"""Shift of a coordinate that a servo would pull to another place by [rad or m]."""
 _CONSTRAINTS = ("EQUALITY", "FRICTIONLOSS", "LIMIT", "CONTACT")
 
 
@@ -63,7 +66,7 @@ class _Reader:
 
     def __init__(self, path: Path, model: Any, mujoco: Any):
         self.path, self.model, self.mujoco = path, model, mujoco
-        self.drives, self.undriven = drives_of(model, mujoco)
+        self.drives, self.pulls, self.undriven = drives_of(model, mujoco)
         self.bodies = self.unique([model.body(i).name or f"body {i}" for i in range(1, model.nbody)])
         self.joints = self.unique([self.joint_name(j) for j in range(model.njnt)])
         self.lacking = [*lacking_of(model, mujoco), *self.undriven]
@@ -91,7 +94,7 @@ class _Reader:
             links += [Link(joint.child) for joint in chain[:-1]]
             links.append(self.link(i))
             joints += chain
-        joints = self.followed(joints)
+        joints = self.driven(self.followed(joints))
         meets, parted = meets_of(model, self.mujoco, self.owners)
         x, y, z = (0.0, 0.0, 0.0) if self.off("GRAVITY") else map(float, model.opt.gravity)
         ties = () if self.off("EQUALITY") else tuple(self.ties())
@@ -259,13 +262,41 @@ class _Reader:
                 held[name] = homes[name] + shift
                 joints[row] = held_at(joints[row], held[name])
                 continue
-            if (drive := joints[row].drive) is not None:
-                text = f"actuator {drive.name!r} drives joint {name!r}, which follows another"
-                self.lacking.append(Lacking(OTHER, text))
-                joints[row] = dataclasses.replace(joints[row], drive=None)
             shift += homes[name] - ratio * homes[self.joints[leader]]
             joints[row] = dataclasses.replace(joints[row], mimics=(self.joints[leader], ratio, shift))
         return without_followers(joints, held)
+
+    def driven(self, joints: list[Connection]) -> list[Connection]:
+        """The joints with the drives of tendons, and of those that follow, on the joint that leads them."""
+        rows = {joint.name: row for row, joint in enumerate(joints)}
+        joints, pulls = list(joints), list(self.pulls)
+        for row, joint in enumerate(joints):
+            if joint.drive is not None and joint.mimics is not None:
+                pulls.append(Pull(joint.drive, {self.joints.index(joint.name): 1.0}))
+                joints[row] = dataclasses.replace(joint, drive=None)
+        for drive, shares in pulls:
+            leaders, ratio, shift = set(), 0.0, 0.0
+            for j, share in shares.items():
+                name, times, plus = led_by(joints, self.joints[j])
+                leaders.add(name)
+                ratio, shift = ratio + share * times, shift + share * plus
+            leader = joints[rows[leaders.pop()]] if len(leaders) == 1 else None
+            why = None
+            if leader is None:
+                why = "several joints, of which none leads the others"
+            elif leader.kind not in ("hinge", "slide") or ratio == 0:
+                why = "joints that do not move"
+            elif leader.drive is not None:
+                why = f"joint {leader.name!r}, which {leader.drive.name!r} drives already"
+            elif drive.kind == "position" and abs(shift) > _SHIFTED:
+                why = "a joint that follows another with a shift"
+            if why is not None or leader is None:
+                text = f"actuator {drive.name!r} drives {why} (tendon or equality)"
+                self.lacking.append(Lacking(OTHER, text))
+                continue
+            moved = dataclasses.replace(drive, gear=drive.gear * ratio)
+            joints[rows[leader.name]] = dataclasses.replace(leader, drive=moved)
+        return joints
 
     def ties(self) -> list[Tie]:
         """What `connect` and `weld` hold together."""
