@@ -36,7 +36,7 @@ ODD = {
     "limits in degrees": (toml(body="", more=HINGE + "limits = [-90, 90]"), "are they in degrees"),
     "anchor in the world": (toml(body="", more=HINGE + "anchor = [0, 0, 0.3]"), "body's own frame"),
     "floor upside down": (toml(floor="normal = [0, 0, -1]"), "begins 0.07 m inside 'floor'"),
-    "half inside": (toml(body=""), "begins 0.02 m inside 'floor'"),
+    "half inside": (toml(body="position = [0, 0, 0]"), "begins 0.02 m inside 'floor'"),
     "below the floor": (toml(body="position = [0, 0, -0.5]"), "begins 0.52 m inside"),
     "a sheet": (toml(half="[0.045, 0.03, 1e-6]", mass=1e-5), "too thin for its samples"),
     "shorter than a step": (toml(top="timestep = 0.005\nduration = 0.001"), "0.005 s are run"),

@@ -248,14 +248,12 @@ def doubts_of_state(
                     " is omega in rad/s?",
                 )
             )
-        if np.array_equal(np.asarray(state.orientation[i]), (0.0, 0.0, 0.0, 1.0)):
-            found.append(
-                Doubt(
-                    4,
-                    f"orientation [0, 0, 0, 1] of {body.name!r} is a half turn about z: quaternions are"
-                    " wxyz, and no turn is [1, 0, 0, 0]",
-                )
-            )
+    turns = np.asarray(state.orientation, np.float64)[list(layout.free)]
+    # One among others is meant so.
+    if len(turns) and np.all(turns == np.array([0.0, 0.0, 0.0, 1.0])):
+        names = ", ".join(repr(bodies[i].name) for i in layout.free[:3])
+        text = f"orientation [0, 0, 0, 1] of {names} is a half turn about z: quaternions are wxyz"
+        found.append(Doubt(4, f"{text}, and no turn is [1, 0, 0, 0]"))
     for i, body in enumerate(bodies):
         if body.fixed and (np.any(speeds[i]) or np.any(np.asarray(state.omega[i]))):
             found.append(Doubt(3, f"{body.name!r} is fixed: the velocity of its state moves nothing"))

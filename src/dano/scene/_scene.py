@@ -380,22 +380,30 @@ class Scene(eqx.Module):
             state = self.filled(dataclasses.replace(state, **of_joints))
         self.check_state(state)
         warn_of_limits(self.layout, self.joints, state.q, self.timestep, joint_names or {})
-        placed = [name for name, given in bodies.items() if {"position", "origin", "q"} & set(given)]
-        say_doubts(self._doubts_of(state, placed), stacklevel=3)
+        say_doubts(self._doubts_of(state, bodies), stacklevel=3)
         return state
 
-    def doubts(self, state: State) -> list[Doubt]:
-        """What is odd about the scene and a state: units, frames, slips; none where numbers are traced."""
+    def doubts(self, state: State, given: ByName | None = None) -> list[Doubt]:
+        """What is odd about the scene and a state: units, frames, slips; none where numbers are traced.
+
+        Args:
+            state: The state.
+            given: What it was made from, see `initial_state`: only bodies that were placed are judged by where
+                they are. Default: all of them.
+        """
         return [
             *doubts_of_scene(self.bodies, self.joints, self.contacts, self.gravity),
-            *self._doubts_of(state, self.names),
+            *self._doubts_of(state, given),
         ]
 
-    def _doubts_of(self, state: State, placed: Sequence[str]) -> list[Doubt]:
-        """Of a state; `placed`: bodies of which somebody said where they are."""
+    def _doubts_of(self, state: State, given: ByName | None) -> list[Doubt]:
+        """Of a state alone; see `doubts`."""
         if is_traced(state, self.timestep):
             return []
-        pairs = [pair for pair in self.point_pairs if {self.names[i] for i in pair} & set(placed)]
+        placed = set(self.names)
+        if given is not None:
+            placed = {name for name, numbers in given.items() if {"position", "origin", "q"} & set(numbers)}
+        pairs = [pair for pair in self.point_pairs if {self.names[i] for i in pair} & placed]
         return doubts_of_state(self.bodies, pairs, self.layout, state, float(self.timestep))
 
     def filled(self, state: State) -> State:

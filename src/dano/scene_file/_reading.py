@@ -274,7 +274,9 @@ def parse_scene(
     schedule = read_schedule(top, scene)
     made = SceneFile(scene, state, int(steps), schedule, path, text, objects, default_law)
     asked = top.number("duration") if n_steps is None and "duration" in top else None
-    say_doubts([*scene.doubts(state), *file_doubts(scene, state, schedule, int(steps), asked)], stacklevel=3)
+    say_doubts(
+        [*scene.doubts(state, start), *file_doubts(scene, state, schedule, int(steps), asked)], stacklevel=3
+    )
     return made
 
 
