@@ -388,8 +388,8 @@ class Scene(eqx.Module):
 
         Args:
             state: The state.
-            given: What it was made from, see `initial_state`: only bodies that were placed are judged by where
-                they are. Default: all of them.
+            given: What it was made from, see `initial_state`: only bodies that were placed are judged by
+                where they are. Default: all of them.
         """
         return [
             *doubts_of_scene(self.bodies, self.joints, self.contacts, self.gravity),
