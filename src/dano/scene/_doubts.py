@@ -23,8 +23,8 @@ from dano.scene._states import State
 
 MOST_SAID = 3
 """Doubts of one thing that are said at once, the worst first."""
-LIGHTEST, HEAVIEST = 1.0, 25e3
-"""Densities [kg/m³] between those of air (1.2) and osmium (22,600), which no body exceeds."""
+LIGHTEST, HEAVIEST = 0.1, 25e3
+"""Densities [kg/m³] far below that of air (1.2), and above that of osmium (22,600), which no body exceeds."""
 _LONGEST = 20.0
 """Size [m] of a body that moves, from which it is rather in millimetres."""
 _THINNEST = 1e-4
