@@ -237,21 +237,18 @@ def _limit(kinds: Sequence[str], size: int) -> list[Entry]:
 
 
 def _entries(folder: Path) -> list[Entry]:
-    """What lies in the folder of a kind: folders that hold files, and files, those of one stem together."""
-    if not folder.is_dir():
-        return []
-    if folder.name in ("kernels", "compiled"):
-        # Below a folder for a version of what compiles.
-        inner = [path for version in folder.iterdir() if version.is_dir() for path in version.iterdir()]
-        # What begins with a dot is in use by a command that runs.
-        return [entry for path in inner if path.name[0] != "." and (entry := _entry([path]))]
+    """What lies in the folder of a kind: files, those of one stem together, and what compilers keep."""
+    found: list[list[Path]] = []
     together: dict[str, list[Path]] = {}
-    for path in folder.iterdir():
+    for path in folder.iterdir() if folder.is_dir() else ():
         if path.name.startswith(_PART):
             _tidy(path)
-        else:
+        elif path.is_dir():
+            # What begins with a dot is in use by a command that runs.
+            found += [[inner] for inner in path.iterdir() if inner.name[0] != "."]
+        elif path.name[0] != ".":
             together.setdefault(path.stem, []).append(path)
-    return [entry for paths in together.values() if (entry := _entry(paths))]
+    return [entry for paths in (*found, *together.values()) if (entry := _entry(paths))]
 
 
 def _tidy(part: Path) -> None:
