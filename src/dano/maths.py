@@ -9,7 +9,7 @@ import functools
 import operator
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, TYPE_CHECKING, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -26,8 +26,12 @@ Numbers = ArrayLike | Sequence[Any]
 
 Q = TypeVar("Q", Array, np.ndarray)
 """Arrays of JAX or of NumPy."""
-AnyArray = Array | np.ndarray | np.generic
-"""An array of JAX or of NumPy."""
+if TYPE_CHECKING:
+    # Which of the two it is depends on what a function is called with: checks of types cannot follow that.
+    AnyArray: TypeAlias = Any
+else:
+    AnyArray = Array | np.ndarray | np.generic
+    """An array of JAX or of NumPy."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SERIES = 1e-4

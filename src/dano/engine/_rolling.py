@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from dano.engine._compiling import by_numpy_on_cpus, compiled, is_enclosed
-from dano.engine._controls import asked
+from dano.engine._controls import asked, Policy
 from dano.engine._reports import Report
 from dano.maths import is_traced, library, on_device
 from dano.scene import Control, Scene, State
@@ -133,21 +133,23 @@ def _jitted_scan(
     scene: Scene,
     prepared: Any,
     state: State,
-    controls: Any,
+    controls: Control | Policy | None,
     n_steps: int,
     segment: int | None,
 ) -> tuple[State, Report]:
+    given = controls if isinstance(controls, Control) else None
+    policy = None if controls is None or isinstance(controls, Control) else controls
+
     def advance(state: State, inputs: Any) -> Any:
         index, control = inputs
-        if callable(controls):
-            control = asked(controls, scene, state, scene.timestep * index)
+        if policy is not None:
+            control = asked(policy, scene, state, scene.timestep * index)
         following, report = engine.step(scene, prepared, state, control)
         return following, (following, report)
 
     def scan(state: State, inputs: Any) -> Any:
         return jax.lax.scan(advance, state, inputs)
 
-    given: Control | None = None if callable(controls) else controls
     steps = jnp.arange(n_steps, dtype=scene.timestep.dtype), given
     if segment is None or segment >= n_steps:
         _, (states, report) = scan(state, steps)

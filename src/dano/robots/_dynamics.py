@@ -70,15 +70,15 @@ def bias_forces(scene: Scene, state: State, *, joints: bool = False) -> Float[Ar
     """
     checked_kind("scene", scene, Scene)
     scene.check_state(state)
-    return _jitted_bias(scene, state)
+    found = _jitted_bias(scene, state)
+    return _of_joints(scene, found) if joints else found
 
 
 @eqx.filter_jit
 def _jitted_bias(scene: Scene, state: State) -> Float[Array, " k"]:
     still = jnp.zeros(scene.layout.n_velocities, scene.timestep.dtype)
     force, torque, jacobian, rows = _needed(scene, state, still)
-    found = _pulled(jacobian[rows], force, torque)
-    return _of_joints(scene, found) if joints else found
+    return _pulled(jacobian[rows], force, torque)
 
 
 def gravity_forces(scene: Scene, state: State, *, joints: bool = False) -> Float[Array, " k"]:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from dano.checks import checked_items, checked_kind
 from dano.contact import ContactParams
 from dano.maths import (
+    AnyArray,
     by_numpy,
     checked_array,
     checked_floating,
@@ -20,7 +21,6 @@ from dano.maths import (
     library,
     Numbers,
     on_device,
-    Q,
     quat_multiply,
     quat_rotate,
 )
@@ -258,7 +258,7 @@ class Robot:
             place = frame.places[shown[name]] if name in shown else place
             position, orientation = (np.asarray(x, bodies[name].com.dtype) for x in place)
             given[name] = dict(orientation=orientation)
-            speeds = tuple(np.asarray(x) for x in frame.speeds[shown[name]]) if name in shown else None
+            speeds = frame.speeds[shown[name]] if name in shown else None
             given[name] |= _of_centre(bodies[name].com, position, orientation, speeds)
         return given
 
@@ -382,15 +382,15 @@ class Robot:
         dtype = scene.timestep.dtype
         own = position.astype(dtype), orientation.astype(dtype)
         if body is None:
-            return *map(on_device, own), jnp.zeros((6, scene.layout.n_velocities), dtype)
+            return on_device(own[0]), on_device(own[1]), jnp.zeros((6, scene.layout.n_velocities), dtype)
         i = scene.index(body)
         return _placed(scene.frames(state), scene.bodies[i].com, scene.bodies[i].com_offset, i, *own)
 
 
 @by_numpy
 def _of_centre(
-    com: Q, position: np.ndarray, orientation: np.ndarray, speeds: tuple[np.ndarray, np.ndarray] | None
-) -> dict[str, Q]:
+    com: AnyArray, position: AnyArray, orientation: AnyArray, speeds: tuple[AnyArray, AnyArray] | None
+) -> dict[str, Any]:
     """Where the centre of mass of a body is whose frame has a place, and how it moves."""
     arm = quat_rotate(orientation, com)
     if speeds is None:
@@ -401,7 +401,9 @@ def _of_centre(
 
 
 @by_numpy
-def _placed(frames: Frames, com: Q, offset: Q, i: int, position: np.ndarray, orientation: np.ndarray):
+def _placed(
+    frames: Frames, com: AnyArray, offset: AnyArray, i: int, position: AnyArray, orientation: AnyArray
+) -> Any:
     """See `Robot.place`: of a frame in the field frame of body i."""
     q = frames.orientation[i]
     arm = quat_rotate(q, position - (com + offset).astype(position.dtype))

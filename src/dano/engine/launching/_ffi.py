@@ -9,11 +9,12 @@ worlds from running on all cores.
 import ctypes
 import traceback
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 
-Handler = Callable[[Sequence[int], Sequence[int], "Call"], None]
-"""From the addresses of the inputs and outputs."""
+Handler = Callable[[Sequence[int], Sequence[int], Any], None]
+"""From the addresses of the inputs and outputs, and a `Call`; None outside of programs of XLA."""
 
 _WORD = ctypes.c_size_t
 _SIGNATURE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
