@@ -31,8 +31,8 @@ def test_bodies_start_where_they_say_unless_told_otherwise(scene):
     state = scene.initial_state()
     np.testing.assert_array_equal(state["ball"].position, (0, 0, 0.2))
     np.testing.assert_array_equal(state["ball"].velocity, (0.3, 0, 0))
-    told = scene.initial_state(ball=dict(origin=(1, 0, 0)))
-    np.testing.assert_array_equal(told["ball"].position, (1, 0, 0))
+    told = scene.initial_state(ball=dict(origin=(1, 0, 1)))
+    np.testing.assert_array_equal(told["ball"].position, (1, 0, 1))
     np.testing.assert_array_equal(told["ball"].velocity, (0.3, 0, 0))
 
 

@@ -275,7 +275,7 @@ class Body(eqx.Module):
         )
 
     def half_space_at(
-        self, position: Float[Array, "3"], orientation: Float[Array, "4"]
+        self, position: Float[Array | np.ndarray, "3"], orientation: Float[Array | np.ndarray, "4"]
     ) -> tuple[Float[np.ndarray, "3"], float] | None:
         """Unit normal [W] and distance from the origin [m] of its plane; None if it is not a half-space.
 

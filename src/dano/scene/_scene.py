@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -140,7 +141,11 @@ class Scene(eqx.Module):
         traced = any(is_traced(body.mass, body.mass_scale) for body in self.bodies) or is_traced(
             self.timestep
         )
-        return repr(self) if traced else plain(*self._summary(drawn=False))
+        if traced:
+            return repr(self)
+        # Within a function that is being traced, too, the numbers of a scene that is not are known.
+        with jax.ensure_compile_time_eval():
+            return plain(*self._summary(drawn=False))
 
     def _repr_html_(self) -> str:
         """What notebooks show: bodies with mass and size, and what may touch."""
