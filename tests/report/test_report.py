@@ -119,7 +119,9 @@ def test_draft(run: Run, tmp_path):
     """Half the size, fewer frames, and no shadow that a film has."""
     path, strips = tmp_path / "run.mp4", []
     for draft in (True, False):
-        options = VideoOptions(fps=30, size=SIZE, camera="fixed", contact_points=False, clock=False, draft=draft)
+        options = VideoOptions(
+            fps=30, size=SIZE, camera="fixed", contact_points=False, clock=False, draft=draft
+        )
         strips.append(tmp_path / f"{draft}.png")
         render_trajectory(*run, path if draft else None, strip=strips[-1], options=options)
     with av.open(path) as container:
