@@ -2,6 +2,7 @@
 
 import warnings
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -51,7 +52,7 @@ def test_what_is_up_stays_above(tmp_path):
     bell("y").export(path)
     with pytest.warns(UserWarning, match="y is up"):
         field = dano.mesh_field(path, 32)
-    assert float(field.sdf(np.array([0.0, 0.0, 0.09]))) < 0 < float(field.sdf(np.array([0.0, 0.0, -0.05])))
+    assert float(field.sdf(jnp.array([0.0, 0.0, 0.09]))) < 0 < float(field.sdf(jnp.array([0.0, 0.0, -0.05])))
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply"])
