@@ -12,6 +12,9 @@ import dano
 from dano.scene_file import check_scene, parse_scene, SceneFile
 from dano.scene_file._forecast import bounds, forecast
 
+# What is odd about these scenes is said when they are read, too: here it is foretold.
+pytestmark = pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
+
 BALL_ON_FLOOR = """
 timestep = {h}
 n_steps = 40

@@ -29,7 +29,7 @@ LATE = '[[controls]]\nbody = "box"\nforce = [1, 0, 0]\nfrom = 2.0'
 ODD = {
     "millimetres": (toml(half="[45, 30, 20]", body="position = [0, 0, 50]"), "less than air has"),
     "grams": (toml(mass=150), "more than any metal has"),
-    "degrees a second": (toml(body=ABOVE + "\nomega = [720, 0, 0]"), "is omega in rad/s"),
+    "degrees a second": (toml(body=ABOVE + "\nomega = [720, 0, 0]"), "or is omega in rad/s"),
     "millimetres a second": (toml(body=ABOVE + "\nvelocity = [1200, 0, 0]"), "is its velocity in m/s"),
     "gravity upwards": (toml(top=TOP + "\ngravity = [0, 0, 9.81]"), "gravity points up"),
     "xyzw": (toml(body=ABOVE + "\norientation = [0, 0, 0, 1]"), "quaternions are wxyz"),

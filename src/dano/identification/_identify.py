@@ -105,7 +105,7 @@ def identify(
     except np.linalg.LinAlgError as error:
         raise ValueError(
             "observed must be motions that the scene can follow, got some from which the simulation ends in"
-            " numbers that are none: check their frame and units, the initial state and the bounds"
+            " numbers that are not finite: check their frame and units, the initial state and the bounds"
         ) from error
     for message in found.messages:
         warnings.warn(message, RuntimeWarning, stacklevel=2)

@@ -52,10 +52,12 @@ class Doubt(NamedTuple):
     Attributes:
         rank: The lowest is said first.
         text: In one line.
+        subject: "sizes": units, frames and slips; "spin" or "start".
     """
 
     rank: int
     text: str
+    subject: str = "sizes"
 
 
 class SceneWarning(UserWarning):
@@ -246,7 +248,9 @@ def doubts_of_state(
                 Doubt(
                     1,
                     f"{body.name!r} turns by {math.degrees(spin * timestep):.0f}° in a step, more than 60°:"
-                    " is omega in rad/s?",
+                    f" its precession is not resolved; use a timestep of {2 * RESOLVED / spin:.2g} s, or is omega"
+                    " in rad/s?",
+                    "spin",
                 )
             )
     turns = orientation[list(layout.free)]
@@ -286,5 +290,5 @@ def _begins_inside(
         depth = offset - float(((position[k] + turned) @ normal).min())
         if depth > _DEEP * float(_extents(body).min()):
             text = f"{body.name!r} begins {depth:.3g} m inside {floor.name!r}: it will be pushed out"
-            found.append(Doubt(1, text))
+            found.append(Doubt(1, text, "start"))
     return found

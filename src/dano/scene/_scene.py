@@ -418,7 +418,8 @@ class Scene(eqx.Module):
         placed = set(self.names)
         if given is not None:
             placed = {name for name, numbers in given.items() if {"position", "origin", "q"} & set(numbers)}
-        pairs = [pair for pair in self.point_pairs if {self.names[i] for i in pair} & placed]
+        moved = {i for i, body in enumerate(self.bodies) if not body.fixed and body.name in placed}
+        pairs = [pair for pair in self.point_pairs if moved & set(pair)]
         return doubts_of_state(self.bodies, pairs, self.layout, state, float(self.timestep))
 
     def filled(self, state: State) -> State:

@@ -108,7 +108,8 @@ def forecast(scene: Scene, state: State, limits: list[Bound]) -> list[Finding]:
     """What will not be resolved, from numbers alone."""
     return [
         *support(scene, limits),
-        *(Finding("sizes", doubt.text) for doubt in scene.doubts(state)),
+        # Where bodies start is measured, see `starts`.
+        *(Finding(x.subject, x.text) for x in scene.doubts(state) if x.subject != "start"),
         *(finding for contact in scene.contacts for finding in _pair(scene, state, contact, limits)),
         *_masses(scene),
         *_samples(scene),
