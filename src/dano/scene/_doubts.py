@@ -248,8 +248,8 @@ def doubts_of_state(
                 Doubt(
                     1,
                     f"{body.name!r} turns by {math.degrees(spin * timestep):.0f}° in a step, more than 60°:"
-                    f" its precession is not resolved; use a timestep of {2 * RESOLVED / spin:.2g} s, or is omega"
-                    " in rad/s?",
+                    f" its precession is not resolved; use a timestep of {2 * RESOLVED / spin:.2g} s, or is"
+                    " omega in rad/s?",
                     "spin",
                 )
             )
