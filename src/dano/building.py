@@ -1,7 +1,7 @@
 """How to make a neural object of a field: what `dano build`, scene files and Python let one choose."""
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 from dano.objects import MassModel
 
@@ -42,7 +42,7 @@ class BuildOptions:
     seed: int = 0
 
     @property
-    def of_file(self) -> dict[str, str]:
+    def of_file(self) -> dict[str, Any]:
         """Those that count where the file is read, as options of `load_field`."""
         given = {"units": self.units, "up": self.up}
         return {name: value for name, value in given.items() if value is not None}
