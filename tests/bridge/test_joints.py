@@ -13,6 +13,9 @@ import dano
 from dano.mujoco import MuJoCoEngine
 from dano.mujoco._settings import damping_ratio, rebound, spring_of
 
+# Scenes here are odd on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
+
 GRAVITY = 9.81
 ROD = dano.Box((0.1, 0.02, 0.01))
 INERTIA = 1.0 * (0.02**2 + 0.1**2) / 3

@@ -133,10 +133,9 @@ def _touching(bridge, model, data, pose):
     mujoco.mj_comPos(model, data)
     mujoco.mj_comVel(model, data)
     n, search = bridge._table(model).find(model, data)
-    touches = search.arguments[-1].touches
-    touches.zero_()
+    touches = search.touches
+    touches[...] = 0
     search.launch()
-    touches = touches.numpy()
     return search.rows[:n], touches[touches["weight"] > 0]
 
 

@@ -10,6 +10,9 @@ import pytest
 import dano
 from dano.scene_file import load_asset, load_run, load_scene, parse_scene, save_run
 
+# Scenes here are odd on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
+
 
 def test_defaults_and_all_pairs(scene):
     text = scene.read_text(encoding="utf-8").split("[[contacts]]")[0]

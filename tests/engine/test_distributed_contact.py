@@ -65,6 +65,7 @@ def test_force_does_not_depend_on_the_number_of_samples():
     np.testing.assert_allclose(forces, exact, rtol=0.04)
 
 
+@pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
 def test_default_stiffness_carries_the_weight_at_half_a_percent():
     for size, mass in ((0.05, 0.05), (1.0, 50.0)):
         scene = on_floor(dano.Body("body", dano.Box((size / 2,) * 3), mass=mass))

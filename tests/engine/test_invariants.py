@@ -11,6 +11,9 @@ from engine.scenes import angular_momentum, last, on_floor, point_cloud_box
 import dano
 from dano.maths import quat_rotate
 
+# Scenes here are odd on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
+
 INERTIA = np.array([[0.05, 0.004, -0.01], [0.004, 0.12, 0.002], [-0.01, 0.002, 0.15]])
 
 

@@ -263,6 +263,7 @@ class _Viscous(AbstractContactLaw):
         return True
 
 
+@pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
 def test_laws_that_no_step_would_ask():
     """They are refused before the first step, by name."""
     bodies = [

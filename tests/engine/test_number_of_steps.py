@@ -33,9 +33,9 @@ def compilations():
     """Durations of what XLA compiles while the test runs."""
     found: list[str] = []
 
-    def listen(name: str, duration: float, **_: object) -> None:
-        if "backend_compile" in name:
-            found.append(name)
+    def listen(event: str, duration_secs: float, **_: object) -> None:
+        if "backend_compile" in event:
+            found.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield found
@@ -54,12 +54,14 @@ def test_rollouts(cart, compilations):
     compilations.clear()
     many = dano.simulate(scene, state, 12)
     assert not compilations
+    assert many.states.q is not None
     assert many.states.position.shape == (13, 4, 3) and many.states.q.shape == (13, 2)
     same_beginnings(few, many)
     pushes = dano.Control(jnp.zeros((7, 4, 3)), jnp.zeros((7, 4, 3)), jnp.ones((7, 2)))
     compilations.clear()
     pushed = dano.simulate(scene, state, controls=pushes)
     assert not compilations
+    assert pushed.states.q is not None
     assert len(pushed.times) == 8 and float(pushed.states.q[-1, 0]) > float(many.states.q[7, 0])
 
 
@@ -89,7 +91,9 @@ def test_gains_that_a_policy_holds(cart):
         def policy(state, time):
             return dano.joint_control(scene, jnp.stack([gain - state.v[0], 0 * gain]))
 
-        return dano.simulate(scene, state, 10, controls=policy).states.q[-1, 0]
+        q = dano.simulate(scene, state, 10, controls=policy).states.q
+        assert q is not None
+        return q[-1, 0]
 
     numeric = (way(1.01) - way(0.99)) / 0.02
     np.testing.assert_allclose(jax.grad(way)(1.0), numeric, rtol=1e-6)

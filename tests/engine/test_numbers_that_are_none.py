@@ -32,7 +32,7 @@ def assert_lost(run: dano.Trajectory, first: int, *, joints: bool = False):
     """States are NaN from a step on, and marked; those before are as usual."""
     states = run.states.q if joints else run.states.position[:, 0]
     assert states is not None
-    lost = ~np.isfinite(np.asarray(states)).all(axis=-1)
+    lost = np.atleast_1d(~np.isfinite(np.asarray(states)).all(axis=-1))
     np.testing.assert_array_equal(lost, np.arange(len(lost)) > first)
     np.testing.assert_array_equal(run.converged, np.arange(len(run.converged)) < first)
     np.testing.assert_array_equal(np.isnan(run.residuals), np.arange(len(run.residuals)) >= first)

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ def made(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def cache(made, tmp_path, monkeypatch) -> Path:
+def cache(made, tmp_path, monkeypatch) -> Iterator[Path]:
     """A copy of it, which a test may damage, as the only place where objects lie."""
     folder = tmp_path / "cache"
     shutil.copytree(made, folder)

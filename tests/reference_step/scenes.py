@@ -204,7 +204,8 @@ def on_joints(joints, bodies=(), **options):
         made.append(
             dano.Joint(parent, name, kind, axis=rng.normal(size=3), orientation=turn, **where, **laws)
         )
-    return dano.Scene.create(bodies, joints=made, timestep=H, **options)
+    touching = {} if {"contacts", "others"} & set(options) else {"contacts": ()}
+    return dano.Scene.create(bodies, joints=made, timestep=H, **touching, **options)
 
 
 def random_motion(scene, speed, spin, seed=7):

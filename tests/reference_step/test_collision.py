@@ -10,6 +10,9 @@ from scipy.spatial import cKDTree
 
 import dano
 
+# Scenes here are odd on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
+
 CASES = [
     *((name, what) for name in scenes.PAIRS for what in ("sliding", "tilted", "hitting", "deep")),
     *((name, f"spinning at {spin:.0f} rad/s") for name in scenes.PAIRS for spin in scenes.SPINS[1::2]),

@@ -9,6 +9,9 @@ from reference_step.kinematics import Kinematics
 from reference_step.rotations import matrix, momentum
 from reference_step.step import root, Step, step
 
+# Scenes here are odd on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
+
 QUANTITIES = ("position", "orientation", "velocity", "omega")
 CASES = [(name, what) for name in scenes.PAIRS for what in scenes.names(name)]
 

@@ -13,6 +13,9 @@ from reference_step.step import step
 
 import dano
 
+# Scenes here are odd on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
+
 QUANTITIES = ("position", "orientation", "velocity", "omega", "q", "v")
 MOTIONS = [(0.1, 0.1), (1.0, 1.0), (20.0, 20.0), (100.0, 100.0), (1.0, 400.0), (0.1, 600.0)]
 """Speeds of joints and spins of free bodies [rad/s or m/s]."""

@@ -175,7 +175,9 @@ def test_drives_of_tendons_and_of_joints_that_follow(tmp_path, actuator: str, ra
     scene = robot.scene(timestep=2e-4)
     control = robot.control(scene, dict(m=0.02))
     repeated = jax.tree.map(lambda x: jnp.repeat(x[None], 500, axis=0), control)
-    q = float(dano.simulate(scene, robot.state(scene), controls=repeated).states.q[-1, 0])
+    moved = dano.simulate(scene, robot.state(scene), controls=repeated).states.q
+    assert moved is not None
+    q = float(moved[-1, 0])
     assert q == pytest.approx(float(data.joint("l").qpos[0]), rel=0.02)
     assert abs(q) > 1e-4
 

@@ -3,9 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import dano
 from dano.scene import _frames, place_links
+
+# Scenes here are odd on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
 
 PARENTS = [None, "0", "0", "1", "3", "3", "2"]
 KINDS = ["hinge", "slide", "ball", "weld", "planar", "hinge", "hinge"]

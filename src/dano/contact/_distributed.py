@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -173,7 +173,7 @@ class DistributedLaw(AbstractContactLaw):
 
 
 @by_numpy
-def _slow(gravity: Float[Q, ""], size: Numbers) -> Float[AnyArray, ""]:
+def _slow(gravity: Float[Q, ""], size: Any) -> Float[AnyArray, ""]:
     """Speed [m/s] of an impact that counts as slow for bodies of a size [m]."""
     return _SLOW * library(gravity).sqrt(gravity * SINKING * size)
 

@@ -132,7 +132,8 @@ class SignedDistanceGrid(AbstractShape):
         closest, beyond, inside = self._split(x)
         coefficients: Any = self.coefficients
         rows = spline_jet(coefficients, closest, degree_of(self.interpolation), order)
-        jet = scaled_jet(rows, self.spacing.astype(x.dtype), order)
+        spacing: Any = self.spacing.astype(x.dtype)
+        jet = scaled_jet(rows, spacing, order)
         distance = column_norm(beyond)
         if order == 0:
             return jet + distance

@@ -224,12 +224,12 @@ def _motion(state: State) -> tuple[Array, ...]:
     return state.position, state.orientation, state.velocity, state.omega, *joints
 
 
-def _constants(scene: Scene, control: Control | None) -> tuple[Array, ...]:
+def _constants(scene: Scene, control: Control | None) -> tuple[AnyArray, ...]:
     """The numbers of `Constants`."""
     dtype, laws, k = scene.timestep.dtype, scene.chains.laws, scene.layout.n_joints
     still, idle = jnp.zeros((len(scene.bodies), 3), dtype), jnp.zeros(k, dtype)
 
-    def given(value: Array | None, default: Array) -> Array:
+    def given(value: AnyArray | None, default: AnyArray) -> AnyArray:
         return default if value is None else value
 
     control = lifted(scene, control)

@@ -250,10 +250,11 @@ class Search:
         self.options[1], self.options[4] = most, is_gap_beyond(mujoco)
         self.found = np.zeros(1, np.int32)
         parameters = Parameters(known.kernel.layout)
+        self.touches = parameters.rows("work.touches", max(known.room, 1))
         work = {
             "options": self.options[None],
             "settings": self.settings,
-            "touches": parameters.rows("work.touches", max(known.room, 1)),
+            "touches": self.touches,
             "scores": np.zeros(most + 1),
             "heads": np.zeros(most, np.int32),
             "rows": self.rows,

@@ -65,7 +65,7 @@ class State(eqx.Module):
     omega: Float[Array, "*t n 3"]
     q: Float[Array, "*t k"] | None = None
     v: Float[Array, "*t k"] | None = None
-    names: tuple[str, ...] | None = eqx.field(static=True, default=None)
+    names: tuple[str, ...] | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __getitem__(self, body: str) -> BodyMotion:
         """Pose and velocity of a body by name.

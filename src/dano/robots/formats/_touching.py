@@ -40,7 +40,7 @@ def meets_of(
         friction = np.where(friction > 0, float(model.opt.o_friction[0]), 0.0)
     found: dict[frozenset[str], Meeting] = {}
     rows = {name: np.flatnonzero(np.array(links) == name) for name in dict.fromkeys(links)}
-    touching = may.any(axis=1)
+    touching = np.asarray(may.any(axis=1))
     parted = []
     names = [name for name, geoms in rows.items() if touching[geoms].any()]
     for k, first in enumerate(names):
