@@ -77,7 +77,8 @@ def test_meshes_become_signed_distances(tmp_path):
     for suffix in ("obj", "ply", "off", "glb"):
         path = tmp_path / f"box.{suffix}"
         trimesh.creation.box((0.2, 0.3, 0.4)).export(path)
-        loaded = load_field(path, resolution=16, edge=0.02, **({"up": "z"} if suffix == "glb" else {}))
+        options: dict[str, Any] = {"up": "z"} if suffix == "glb" else {}
+        loaded = load_field(path, resolution=16, edge=0.02, **options)
         assert isinstance(loaded, SignedDistanceGrid)
         moments = loaded.solid_moments()
         assert moments is not None

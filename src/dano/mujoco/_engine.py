@@ -18,6 +18,7 @@ from dano.callback import host_callback
 from dano.checks import checked_choice, checked_kind, checked_number
 from dano.contact import Patch
 from dano.engine import AbstractEngine, marked, Report, VariationalEngine
+from dano.maths import AnyArray
 from dano.mujoco._model import library
 from dano.mujoco._spec import TOUCHES
 from dano.mujoco._twin import Constants, Motion, Twin
