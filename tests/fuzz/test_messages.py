@@ -272,7 +272,7 @@ WRONG_TYPES = {
     "dano.simulate(falling, falling.initial_state(), 9, checkpoint_every=2.5)": (
         "checkpoint_every must be a whole number, got 2.5"
     ),
-    "dano.simulate(falling, 1.0, 3)": "state must be a dano.State, got 1.0 of type float",
+    "dano.simulate(falling, 1.0, 3)": "state must be a dano.State, got float",
     'dano.simulate("scene.toml", None, 3)': "scene must be a dano.Scene, got str",
     "dano.step(falling, np.zeros(3))": "state must be a dano.State, got ndarray",
     "dano.linearize(ball, falling.initial_state())": "scene must be a dano.Scene, got Body",
