@@ -113,7 +113,7 @@ def test_merged_contacts_do_not_jump(support: str):
     bridge, model, data = attached(world(support))
     top = model.geom_solimp[0, 1]
     changes = []
-    for steps in (300, 600, 1200):
+    for steps in (300, 1200, 4800):
         wrenches = []
         for z in np.linspace(0.0, -0.001, steps + 1):
             rows, _ = _touching(bridge, model, data, [0, 0, z, 1, 0.02, 0.01, 0])
@@ -122,8 +122,9 @@ def test_merged_contacts_do_not_jump(support: str):
             moments = np.cross(rows[:, 1:4], forces)
             wrenches.append([forces.sum(axis=0), moments.sum(axis=0)])
         changes.append(np.linalg.norm(np.diff(wrenches, axis=0), axis=2).max(axis=0))
-    assert np.all(changes[1] < 0.7 * changes[0])
-    assert np.all(changes[2] < 0.7 * changes[1])
+    # Steps are a quarter as long each time; a jump would stay as it is.
+    assert np.all(changes[1] < 0.6 * changes[0])
+    assert np.all(changes[2] < 0.6 * changes[1])
 
 
 def _touching(bridge, model, data, pose):
@@ -173,8 +174,11 @@ def test_few_contacts_carry_what_many_do():
             mujoco.mj_step(model, data, 300)
             begin = data.qpos.copy()
             data.qvel[:] = [0.4, 0.1, 0, 0, 0, 4.0]
-            mujoco.mj_step(model, data, 200)
-        ends.append((begin, data.qpos.copy(), data.ncon))
+            n_contacts = 0
+            for _ in range(200):
+                mujoco.mj_step(model, data)
+                n_contacts = max(n_contacts, data.ncon)
+        ends.append((begin, data.qpos.copy(), n_contacts))
     (_, few, n_few), (begin, many, n_many) = ends
     assert n_few <= 8 < n_many
     way, turn = (float(np.linalg.norm((many - begin)[part])) for part in (slice(0, 3), slice(3, 7)))
