@@ -96,7 +96,7 @@ def test_trained_objects_are_the_solids_and_look_like_the_photographs(name: str,
 
 @pytest.mark.xfail(
     strict=True,
-    reason="shipped before nodes near a mesh were marked by ray crossings: in 2 % of them distances are others,"
+    reason="shipped before nodes near meshes were marked by ray crossings: 2 % of them have other distances,"
     " by up to .3 mm; the soap that is built now rocks in MuJoCo",
 )
 def test_shipped_objects_are_what_is_built_of_their_fields():
