@@ -6,10 +6,10 @@ import importlib.util
 import re
 from pathlib import Path
 
-from dano.native._instances import Features, making
+from dano.native._instances import Features, INSTANCED, making
 
-PACKAGES = ("dano.physics", "dano.engine.kernels", "dano.mujoco.kernels", "dano.vision.drawing.kernels")
-"""Packages of modules that are run once for each set of features."""
+PACKAGES = (*INSTANCED, "dano.vision.drawing.kernels")
+"""Packages of all modules of kernels."""
 _IMPORT = re.compile(r"^(?:from|import) (dano\.[\w.]+)", re.MULTILINE)
 
 

@@ -19,7 +19,8 @@ from dano.native._warp import begin
 
 _FEATURES = "dano.physics.features"
 _LAW = "dano.physics.point_law"
-_PACKAGES = ("dano.physics", "dano.engine.kernels", "dano.mujoco.kernels")
+INSTANCED = ("dano.physics", "dano.engine.kernels", "dano.mujoco.kernels")
+"""Packages of modules that import each other with the features of a build."""
 
 
 class Features:
@@ -85,7 +86,7 @@ def _instance(features: Features, module: str) -> ModuleType:
         # A file of one's own asks for what stands in the module that it changes.
         if name == module and fromlist:
             return made
-        if fromlist and name.startswith(_PACKAGES) and name not in _PACKAGES:
+        if fromlist and name.startswith(INSTANCED) and name not in INSTANCED:
             return instance(features, name)
         return builtins.__import__(name, globals, locals, fromlist, level)
 

@@ -18,11 +18,9 @@ from dano.engine.kernels.tables import Changes, Moment, Room, Scene, StateRow
 from dano.physics.features import LANES, TREES
 from dano.physics.pairs import BodyState
 from dano.physics.real import vec6, ZERO
-from dano.physics.trees.joints import ROOT
 from dano.physics.twists import shift
 
 _LANES = wp.constant(LANES)
-_ROOT = wp.constant(ROOT)
 
 
 @wp.func
