@@ -118,6 +118,11 @@ def test_links_with_a_mark_are_not_judged_by_it():
     link = dano.Body("link", dano.Sphere(0.01), mass=5.0, com=(0, 0, 0.2), inertia=0.1 * np.eye(3))
     joint = dano.Joint(None, "link", anchor=(0, 0, 0.5))
     assert said_of(lambda: dano.Scene.create([link], joints=[joint])) == []
+    # Heavy and small, or there only to carry others.
+    for mass in (0.3, 1e-11):
+        point = dano.Body("link", dano.Sphere(0.01), mass=mass)
+        assert said_of(lambda point=point: dano.Scene.create([point], joints=[joint])) == []
+        assert said_of(lambda point=point: dano.Scene.create([point]))
 
 
 def test_an_axis_and_an_angle_are_no_quaternion():

@@ -9,6 +9,7 @@ import numpy as np
 from dano.checks import shown
 from dano.fields import AbstractShape, HalfSpace, Sphere
 from dano.maths import Pose, quat_conjugate, quat_multiply
+from dano.robots._free import FREE_JOINTS, without_free_laws
 from dano.robots._geometry import checked_collision, shape_of
 from dano.robots._inertia import balanced, chained, Inertial
 from dano.robots._parts import (
@@ -55,6 +56,7 @@ def build_robot(
     shapes = checked_collision(collision, [link.name for link in description.links])
     ignored = checked_ignore(ignore)
     description = without_lacking(description, ignored)
+    description = without_free_laws(description, ignored=FREE_JOINTS in ignored)
     if balance_inertia:
         description = balanced(description)
     description = without_weightless(description, ignored)
