@@ -6,6 +6,7 @@ world and a ball at the frame's origin have just these coordinates: a link on su
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +43,7 @@ def without_free_laws(description: Description, *, ignored: bool) -> Description
             joints.append(joint)
             continue
         if ignored:
-            joints.append(dataclasses.replace(joint, **dict.fromkeys(laws, 0.0)))
+            joints.append(dataclasses.replace(joint, damping=0.0, friction=0.0, armature=0.0, stiffness=0.0))
             continue
         spread[joint.child] = joint
         chain = _chain(joint)
@@ -68,7 +69,7 @@ def without_free_laws(description: Description, *, ignored: bool) -> Description
 def _chain(joint: Connection) -> list[Connection]:
     """Three slides and a ball for a free joint."""
     x, y, z = joint.place.position
-    laws = {law: getattr(joint, law) for law in _LAWS}
+    laws: dict[str, Any] = {law: getattr(joint, law) for law in _LAWS}
     found, parent = [], joint.parent
     for (axis, direction), home in zip(_AXES.items(), (x, y, z), strict=True):
         name = f"{joint.name} {axis}"

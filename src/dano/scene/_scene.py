@@ -480,6 +480,19 @@ class Scene(eqx.Module):
         self.check_state(state)
         return Frames(*by_numpy(frames_of)(self.chains, state))
 
+    def check_weighed(self) -> None:
+        """Check that all masses are known, as steps and forces need it.
+
+        Raises:
+            ValueError: If there are bodies without one.
+        """
+        names = [body.name for body in self.bodies if not (body.fixed or body.weighed)]
+        if names:
+            some = ", ".join(map(repr, names[:4])) + (" …" if len(names) > 4 else "")
+            raise ValueError(
+                f"scene must have bodies of known mass, got none for {some}: it serves kinematics alone"
+            )
+
     def check_state(self, state: State) -> None:
         """Check a concrete state against the scene; traced values pass.
 

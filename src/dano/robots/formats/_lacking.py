@@ -16,6 +16,9 @@ EQUALITIES = "equalities"
 WEIGHTLESS = "weightless joints"
 """Name of joints that move nothing with mass."""
 
+MASSES = "masses"
+"""Name of all masses: what is left of a robot serves kinematics."""
+
 IGNORABLE = {
     "adhesion": "surfaces that stick",
     "surface velocity": "surfaces that move, such as belts",
@@ -27,6 +30,7 @@ IGNORABLE = {
     "fluid": "drag by density and viscosity",
     "free joints": "damping, friction, armature and springs of free joints",
     GRAVCOMP: "compensated weight of bodies",
+    MASSES: "all masses and inertias: the robot serves kinematics alone",
     "height fields": "shapes that are height fields or signed distances",
     "mimics of nothing": "joints that mimic one which does not exist",
     "nonlinear springs": "springs and dampers that are not linear",

@@ -208,7 +208,7 @@ class _Reader:
             int(types.mjJNT_HINGE): "hinge",
         }
         kind, dof = kinds[int(model.jnt_type[j])], int(model.jnt_dofadr[j])
-        laws = {
+        laws: dict[str, Any] = {
             "damping": 0.0 if self.off("DAMPER") else float(model.dof_damping[dof]),
             "friction": 0.0 if self.off("FRICTIONLOSS") else float(model.dof_frictionloss[dof]),
             "armature": float(model.dof_armature[dof]),
