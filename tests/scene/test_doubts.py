@@ -103,6 +103,13 @@ def test_python_says_it_when_it_is_made():
         scene.initial_state(soap=dict(velocity=(1200, 0, 0)))
 
 
+def test_a_centre_of_mass_of_another_frame_is_said():
+    for com, said in (((0.02, 0, 0), 0), ((1.0, 0, 0), 1)):
+        body = dano.Body("ball", dano.Sphere(0.1), mass=1.0, com=com)
+        found = said_of(lambda body=body: dano.Scene.create([body]))
+        assert ["the centre of mass of 'ball' lies 0.9 m beside" in text for text in found] == [True] * said
+
+
 def test_traced_numbers_are_not_judged():
     soap = dano.Body("soap", dano.Box((0.045, 0.03, 0.02)), mass=0.15)
 

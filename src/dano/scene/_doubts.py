@@ -33,7 +33,7 @@ _NO_LENGTHS = ("normal", "offset", "rounding")
 _STRONGEST = 100.0
 """Gravity [m/s²] beyond that of all planets, and of centrifuges for people."""
 _FAR = 3.0
-"""Sizes from a body's middle at which an anchor is rather given in another frame."""
+"""Sizes from a body's middle at which an anchor, or a centre of mass, is rather given in another frame."""
 _TURNS = 10.0
 """Whole numbers beyond these, as limits of a hinge, are rather degrees [rad]."""
 _LEAPS = 10.0
@@ -167,10 +167,16 @@ def density_doubt(body: Body) -> str | None:
 
 
 def _extents(body: Body) -> Float[np.ndarray, "3"]:
+    return np.ptp(_bounds(body), axis=0)
+
+
+def _bounds(body: Body) -> Float[np.ndarray, "2 3"]:
+    """Lower and upper corner of the box around a body [m, F]."""
     if body.object is not None:
-        return np.ptp(np.asarray(body.object.surface.points, np.float64), axis=0)
+        points = np.asarray(body.object.surface.points, np.float64)
+        return np.stack([points.min(axis=0), points.max(axis=0)])
     assert body.shape is not None
-    return np.ptp(np.asarray(body.shape.bounds, np.float64), axis=0)
+    return np.asarray(body.shape.bounds, np.float64)
 
 
 def _of_body(body: Body) -> list[Doubt]:
@@ -181,11 +187,26 @@ def _of_body(body: Body) -> list[Doubt]:
         found.append(Doubt(0, text))
     elif _LONGEST < body.size < np.inf:
         found.append(Doubt(0, f"{body.name!r} is {body.size:.3g} m long: are its lengths in metres?"))
+    if (away := _beside(body)) > _FAR * body.size:
+        text = (
+            f"the centre of mass of {body.name!r} lies {away:.3g} m beside its shape, {away / body.size:.2g}"
+            " times its size: it is a point of the body's own frame"
+        )
+        found.append(Doubt(3, text))
     thin = _thickness(body)
     if thin < _THINNEST * body.size:
         text = f"{body.name!r} is {thin:.2g} m thick and {body.size:.2g} m long: too thin for its samples"
         found.append(Doubt(5, text))
     return found
+
+
+def _beside(body: Body) -> float:
+    """How far the centre of mass lies beside the box around a body [m]; 0 of what has none or is endless."""
+    if not np.isfinite(body.size) or is_traced(body.com):
+        return 0.0
+    low, high = _bounds(body)
+    com = np.asarray(body.com, np.float64)
+    return float(np.linalg.norm(np.maximum(0, np.maximum(low - com, com - high))))
 
 
 def _thickness(body: Body) -> float:
