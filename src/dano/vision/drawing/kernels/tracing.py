@@ -16,6 +16,8 @@ from dano.physics.solids.distances import solid_clearance, solid_distance, solid
 _MOST = wp.constant(96)
 # Share of the distance to the surface that a ray advances; interpolated distances are not quite 1-Lipschitz.
 _CAUTION = wp.constant(real(0.95))
+# Longer steps do as long as what is free around both ends of a step overlaps (Keinert et al. 2014).
+_BOLD = wp.constant(real(1.5))
 _SHADOW_CAUTION = wp.constant(real(0.7))
 # A ray has hit within this share of a pixel, by which silhouettes grow …
 _NEAR = wp.constant(real(0.1))
@@ -45,7 +47,9 @@ _NARROW = wp.constant(real(0.5))
 # inner ray to that one: a step of grey or two.
 _SAME_SIDE, _EVEN, _EXACT = wp.constant(real(0.9)), wp.constant(real(0.15)), wp.constant(real(0.015))
 # … and if a shadow changes by less than this share of a lamp's disc from one ray to the others.
-_GENTLE = wp.constant(real(0.5))
+_GENTLE = wp.constant(real(1.2))
+# Surfaces that are seen at a smaller cosine are taken for this.
+_GRAZING = wp.constant(real(0.05))
 
 
 @wp.struct
@@ -211,13 +215,26 @@ def distance_to(view: View, thing: Thing, direction: vec3, begin: real, limit: r
     leave = wp.min(way.leave, limit)
     t = wp.max(way.enter, begin)
     found = real(INFINITY)
+    bold = real(_BOLD)
+    before = real(0.0)
+    step = real(0.0)
     i = int(0)
     while i < _MOST and t < leave:
         s = solid_clearance(view.solids, 0, solid, o + t * d, _COARSE * size)
-        t += _CAUTION * s
-        if s < wp.max(_NEAR * view.pixel * t, _FINE * size):
-            found = t
-            leave = ZERO
+        if s > ZERO and step > _CAUTION * (before + s):
+            # What is free around both ends leaves a gap between them.
+            t += _CAUTION * before - step
+            bold = _CAUTION
+            step = ZERO
+        else:
+            if s < wp.max(_NEAR * view.pixel * t, _FINE * size):
+                found = t
+                if s < ZERO:
+                    found = t + step * s / (before - s)
+                leave = ZERO
+            before = s
+            step = bold * s
+            t += step
         i += 1
     return found
 
@@ -232,11 +249,11 @@ def normal_of(view: View, thing: Thing, x: vec3) -> vec3:
 
 @wp.struct
 class Shadow:
-    """What a thing takes from the lamp's light at a point.
+    """What a thing takes from a light at a point.
 
     Attributes:
         left: Share of the light that it leaves.
-        steep: How much of the lamp's disc at most it may hide, or show, a metre beside [1/m].
+        steep: How much more of it at most it may hide, or show, a metre beside [1/m].
     """
 
     left: real
@@ -278,16 +295,20 @@ def light_left(view: View, thing: Thing, x: vec3, bias: real, beside: real) -> S
 
 
 @wp.func
-def sky_left(view: View, thing: Thing, x: vec3, normal: vec3, reach: real) -> real:
+def sky_left(view: View, thing: Thing, x: vec3, normal: vec3, reach: real, beside: real) -> Shadow:
     """Share of the light from all around that a thing leaves to a point [m, W] of a surface."""
     solid = solid_of(view.solids, 0, thing.first, thing.count)
     covered = real(0.0)
+    shadow = Shadow()
     for k in range(4):
         height = reach * _HEIGHTS[k]
         place = wp.transpose(thing.rotation) * (x + height * normal - thing.position)
-        s = solid_clearance(view.solids, 0, solid, place, height)
+        s = solid_clearance(view.solids, 0, solid, place, height + beside)
         covered += _WEIGHTS[k] * wp.clamp(ONE - s / height, ZERO, _FULL)
-    return wp.clamp(ONE - covered, _DARKEST, ONE)
+        if s < height + beside:
+            shadow.steep += _WEIGHTS[k] / height
+    shadow.left = wp.clamp(ONE - covered, _DARKEST, ONE)
+    return shadow
 
 
 @wp.struct
@@ -297,12 +318,14 @@ class Light:
     Attributes:
         lamp: Share of the lamp's light.
         ambient: Share of the light from all around.
-        steep: See `Shadow`; of things that the point is not on.
+        steep: See `Shadow`; the lamp's, of things that the point is not on.
+        whole: Whether all light arrives here, and as far beside as was asked for.
     """
 
     lamp: real
     ambient: real
     steep: real
+    whole: bool
 
 
 @wp.func
@@ -312,6 +335,7 @@ def light_at(view: View, met: int, x: vec3, normal: vec3, beside: real) -> Light
     light.lamp = ONE
     light.ambient = ONE
     planes = view.planes.shape[0]
+    light.whole = met < planes
     away = x - view.focus
     if view.shaded == 1 and wp.dot(away, away) < view.far * view.far:
         for k in range(view.things.shape[0]):
@@ -328,10 +352,14 @@ def light_at(view: View, met: int, x: vec3, normal: vec3, beside: real) -> Light
                     # From a little above the surface, or it would shadow itself by rounding.
                     shadow = light_left(view, thing, x + bias * normal, bias, beside)
                     light.lamp *= shadow.left
+                    light.whole = light.whole and shadow.steep == ZERO
                     if met != planes + k:
                         light.steep = wp.max(light.steep, shadow.steep)
-                if square < (thing.radius + reach) * (thing.radius + reach):
-                    light.ambient *= sky_left(view, thing, x, normal, reach)
+                near = thing.radius + reach + beside
+                if square < near * near:
+                    shadow = sky_left(view, thing, x, normal, reach, beside)
+                    light.ambient *= shadow.left
+                    light.whole = light.whole and shadow.steep == ZERO
     if met >= planes:
         for j in range(planes):
             plane = view.planes[j]
@@ -458,36 +486,39 @@ def spread_at_corners(a: wp.array(dtype=wp.float32), first: int) -> real:
 
 
 @wp.func
-def lighten(view: View, rays: Rays, r: int, beside: real) -> real:
-    """What light arrives where a ray ends; returns how steep shadows are there."""
+def lighten(view: View, rays: Rays, r: int, beside: real) -> Light:
+    """What light arrives where a ray ends."""
     x = view.origin + real(rays.depths[r]) * direction_of(rays.directions, r)
     light = light_at(view, rays.which[r], x, normal_met(rays, r), beside)
     rays.lamp[r] = wp.float32(light.lamp)
     rays.ambient[r] = wp.float32(light.ambient)
-    return light.steep
+    return light
 
 
 @wp.func
-def is_lit_between(view: View, rays: Rays, first: int, cone: Cone) -> bool:
-    """Interpolate the light of a block, if that is right."""
+def is_lit_together(view: View, rays: Rays, first: int, cone: Cone, is_regular: bool) -> bool:
+    """Light a block by some of its rays, if that is right: all alike, or, of regular pixels, interpolated."""
     if not is_one_side(rays, first):
         return False
-    # From a corner to the other corners, twice the cone, and as much more as the surface is seen at an angle.
+    # How far the other rays end at most: as the cone is wide, and more where the surface is seen at an angle.
     slant = real(1.0)
     far = real(0.0)
     for i in range(4):
         r = first + i * _TO_CORNER
         slant = wp.min(slant, -wp.dot(normal_met(rays, r), direction_of(rays.directions, r)))
         far = wp.max(far, real(rays.depths[r]))
-    beside = TWO * cone.width * far / wp.max(slant, real(0.05))
-    steep = real(0.0)
+    beside = TWO * cone.width * far / wp.max(slant, _GRAZING)
+    inner = lighten(view, rays, first + _INNER, beside)
+    if inner.whole or not is_regular:
+        return inner.whole
+    steep = inner.steep
     for i in range(4):
-        steep = wp.max(steep, lighten(view, rays, first + i * _TO_CORNER, beside))
+        corner = lighten(view, rays, first + i * _TO_CORNER, beside)
+        steep = wp.max(steep, corner.steep)
     if steep * beside > _GENTLE:
         return False
     if spread_at_corners(rays.lamp, first) > _EVEN or spread_at_corners(rays.ambient, first) > _EVEN:
         return False
-    steep = lighten(view, rays, first + _INNER, beside)
     lamp_off = wp.abs(between(rays.lamp, first, _INNER) - real(rays.lamp[first + _INNER]))
     ambient_off = wp.abs(between(rays.ambient, first, _INNER) - real(rays.ambient[first + _INNER]))
     if lamp_off > _EXACT or ambient_off > _EXACT:
@@ -521,9 +552,9 @@ def trace(view: View, rays: Rays):
             n = normal_of(view, view.things[rays.which[r] - planes], x)
             rays.normals[r] = wp.vec3f(wp.float32(n[0]), wp.float32(n[1]), wp.float32(n[2]))
     done = bool(False)
-    if end <= rays.regular:
-        done = is_lit_between(view, rays, first, cone)
+    if end == first + _BLOCK:
+        done = is_lit_together(view, rays, first, cone, end <= rays.regular)
     if not done:
         for r in range(first, end):
             if rays.which[r] >= 0:
-                steep = lighten(view, rays, r, ZERO)
+                light = lighten(view, rays, r, ZERO)
