@@ -16,8 +16,6 @@ from dano.physics.solids.distances import solid_clearance, solid_distance, solid
 _MOST = wp.constant(96)
 # Share of the distance to the surface that a ray advances; interpolated distances are not quite 1-Lipschitz.
 _CAUTION = wp.constant(real(0.95))
-# Longer steps do as long as what is free around both ends of a step overlaps (Keinert et al. 2014).
-_BOLD = wp.constant(real(1.5))
 _SHADOW_CAUTION = wp.constant(real(0.7))
 # A ray has hit within this share of a pixel, by which silhouettes grow …
 _NEAR = wp.constant(real(0.1))
@@ -215,26 +213,13 @@ def distance_to(view: View, thing: Thing, direction: vec3, begin: real, limit: r
     leave = wp.min(way.leave, limit)
     t = wp.max(way.enter, begin)
     found = real(INFINITY)
-    bold = real(_BOLD)
-    before = real(0.0)
-    step = real(0.0)
     i = int(0)
     while i < _MOST and t < leave:
         s = solid_clearance(view.solids, 0, solid, o + t * d, _COARSE * size)
-        if s > ZERO and step > _CAUTION * (before + s):
-            # What is free around both ends leaves a gap between them.
-            t += _CAUTION * before - step
-            bold = _CAUTION
-            step = ZERO
-        else:
-            if s < wp.max(_NEAR * view.pixel * t, _FINE * size):
-                found = t
-                if s < ZERO:
-                    found = t + step * s / (before - s)
-                leave = ZERO
-            before = s
-            step = bold * s
-            t += step
+        t += _CAUTION * s
+        if s < wp.max(_NEAR * view.pixel * t, _FINE * size):
+            found = t
+            leave = ZERO
         i += 1
     return found
 
