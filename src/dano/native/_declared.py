@@ -10,8 +10,8 @@ from dano.native._instances import Features, INSTANCED
 PACKAGES = (*INSTANCED, "dano.vision.drawing.kernels")
 """Packages of all modules of kernels."""
 _IMPORT = re.compile(r"^(?:from|import) (dano\.[\w.]+)", re.MULTILINE)
-# Python's own parser would do, but that of 3.11 fails where two threads parse at once, and Warp parses whenever it
-# likes. So this is what structures look like: fields, and branches of fields by a feature.
+# Python's own parser would do, but that of 3.11 fails where two threads parse at once, and Warp parses
+# whenever it likes. So this is what structures look like: fields, and branches of fields by a feature.
 _FROM = re.compile(r"^from (dano\.[\w.]+) import (\([^)]*\)|[^\n(]*)", re.MULTILINE)
 _DOCSTRING = re.compile(r'"""[\s\S]*?"""')
 _LINE = re.compile(r"^( +)(?:if (\w+):|(\w+):)", re.MULTILINE)

@@ -2,9 +2,9 @@
 
 Solids are those of contact (`dano.physics.solids`), so that what is drawn is what touches.
 
-Rays of a block share what they can. A cone around them all goes first, so that each begins close to the surface,
-or misses it untried. Light is asked for at the corners of a block and one ray more; between them it is
-interpolated where it varies little.
+Rays of a block share what they can. A cone around them all goes first, so that each begins close to the
+surface, or misses it untried. Light is asked for at the corners of a block and one ray more, and interpolated
+between them where it varies little.
 """
 
 import warp as wp
@@ -41,8 +41,8 @@ _BLOCK = wp.constant(BLOCK)
 _TO_CORNER, _INNER = wp.constant(5), wp.constant(12)
 # A cone ends where what is free around it is less than this share of its radius.
 _NARROW = wp.constant(real(0.5))
-# Light of a block is interpolated if normals agree to this cosine, corners to this share of all light, and the
-# inner ray to that one: a step of grey or two.
+# Light of a block is interpolated if normals agree to this cosine, corners to this share of all light, and
+# the inner ray to that one: a step of grey or two.
 _SAME_SIDE, _EVEN, _EXACT = wp.constant(real(0.9)), wp.constant(real(0.15)), wp.constant(real(0.015))
 # … and if a shadow changes by less than this share of a lamp's disc from one ray to the others.
 _GENTLE = wp.constant(real(1.2))
@@ -542,4 +542,4 @@ def trace(view: View, rays: Rays):
     if not done:
         for r in range(first, end):
             if rays.which[r] >= 0:
-                light = lighten(view, rays, r, ZERO)
+                lighten(view, rays, r, ZERO)
