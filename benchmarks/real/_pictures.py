@@ -48,3 +48,47 @@ def saved(figure, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     return path
+
+
+def squares(
+    path: Path, seen: np.ndarray, ours: np.ndarray, other: np.ndarray, half: float, frames: Sequence[int]
+) -> Path:
+    """Recorded paths of four drops, and squares after a while: recorded, dano's and another's."""
+    figure, axes = figure_of(4, width=2.4, height=1.9)
+    corners = half * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
+    for axis, i in zip(axes, np.linspace(0, len(seen) - 1, 6, dtype=int)[1:5], strict=True):
+        axis.plot(*(1e3 * seen[i, :, :2]).T, color=SEEN, lw=0.8)
+        ends = ((seen[i, frames[-1]], SEEN, "recorded"), (other[i, -1], OTHER, "MuJoCo"), (ours[i, -1], OURS, "dano"))
+        for (x, z, angle), colour, label in ends:
+            turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            axis.plot(*(1e3 * (corners @ turn + [x, z])).T, color=colour, lw=1.2, label=label)
+        axis.axhline(0, color=SEEN, lw=0.5)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_xlabel("mm")
+    axes[0].legend(fontsize=6, loc="upper right", frameon=False)
+    return saved(figure, path)
+
+
+def paths(
+    path: Path,
+    names: Sequence[str],
+    seen: Sequence[np.ndarray],
+    ours: Sequence[np.ndarray],
+    other: Sequence[np.ndarray],
+    half: float,
+) -> Path:
+    """Paths of pushed blocks seen from above, with the block where it ended: recorded, dano's, another's."""
+    n = min(len(names), 4)
+    figure, axes = figure_of(n, width=2.4, height=1.8)
+    corners = half * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
+    for axis, name, *three in zip(axes, names, seen, ours, other, strict=False):
+        for poses, colour, label in zip(three, (SEEN, OURS, OTHER), ("recorded", "dano", "limit surface"), strict=True):
+            axis.plot(*(1e3 * poses[:, :2]).T, color=colour, lw=0.9, label=label)
+            x, y, angle = poses[-1]
+            turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            axis.plot(*(1e3 * (corners @ turn + [x, y])).T, color=colour, lw=0.9)
+        axis.set_title(name, fontsize=6)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_xlabel("mm")
+    axes[0].legend(fontsize=6, loc="best", frameon=False)
+    return saved(figure, path)
