@@ -9,7 +9,16 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_optional, checked_text
 from dano.contact import Collider, ContactParams, SampleSet, Support, SurfaceSet
-from dano.fields import AbstractField, AbstractShape, Ellipsoid, HalfSpace, SignedDistanceGrid, Sphere
+from dano.fields import (
+    AbstractField,
+    AbstractShape,
+    Box,
+    Cylinder,
+    Ellipsoid,
+    HalfSpace,
+    SignedDistanceGrid,
+    Sphere,
+)
 from dano.hosted import hosted
 from dano.maths import (
     AnyArray,
@@ -17,6 +26,7 @@ from dano.maths import (
     checked_array,
     checked_quaternion,
     floating,
+    is_traced,
     library,
     Numbers,
     Q,
@@ -175,8 +185,7 @@ class Body(eqx.Module):
         if self.object is not None:
             return self.object.size
         assert self.shape is not None
-        extent = np.ptp(np.asarray(self.shape.bounds), axis=0)
-        return float(extent.max())
+        return float(np.ptp(np.asarray(self.shape.bounds), axis=0).max())
 
     @property
     def field(self) -> AbstractField | None:
@@ -187,6 +196,13 @@ class Body(eqx.Module):
     def solid(self) -> AbstractShape | None:
         """What other bodies' surface samples press on: the shape, or the object's signed distance."""
         return self.shape if self.object is None else self.object.solid
+
+    @property
+    def is_sharp(self) -> bool:
+        """Whether the surface is known exactly, with its faces, edges and corners."""
+        if isinstance(self.shape, Box):
+            return not is_traced(self.shape.rounding) and float(self.shape.rounding) == 0
+        return isinstance(self.shape, Cylinder | HalfSpace)
 
     @property
     def centre_of_mass(self) -> Float[Array, "3"]:

@@ -56,6 +56,7 @@ def others_of(
     joints: Sequence[Joint | Loop],
     apart: Sequence[tuple[str, str]],
     params: ContactParams,
+    timestep: Float[Array, ""],
     gravity: Float[Array, "3"],
 ) -> tuple[tuple[Body, ...], Others | None]:
     """The bodies with what contact needs of them, and the pairs that are left; None if there are none.
@@ -66,6 +67,7 @@ def others_of(
         joints: And loops: what joins needs not touch.
         apart: Names of further pairs that do not touch.
         params: What bodies without a material of their own are made of.
+        timestep: h [s].
         gravity: [m/s², W].
 
     Raises:
@@ -92,7 +94,7 @@ def others_of(
         return tuple(bodies), None
     touching = {i for pair in pairs for i in pair}
     bodies = tuple(with_surface(body) if i in touching else body for i, body in enumerate(bodies))
-    return bodies, Others(_stacked(bodies, touching, law, params, gravity), law, tuple(pairs))
+    return bodies, Others(_stacked(bodies, touching, law, params, timestep, gravity), law, tuple(pairs))
 
 
 def unnamed_contacts(
@@ -170,6 +172,7 @@ def _stacked(
     touching: set[int],
     law: DistributedLaw,
     usual: ContactParams,
+    timestep: Float[Array, ""],
     gravity: Float[Array, "3"],
 ) -> ContactParams:
     """Complete parameters of all bodies as arrays.
@@ -190,8 +193,11 @@ def _stacked(
         decide = [i] if i in moving else moving
         return lambda sinking: functools.reduce(jnp.minimum, [stiffness(k, sinking) for k in decide])
 
+    # What is soft against one of them is so against all.
+    sharp = all(bodies[i].is_sharp for i in touching)
     complete = []
     for i, body in enumerate(bodies):
         given = usual if body.material is None else body.material
-        complete.append(law.complete(given, Setting(min(body.size, largest), strength, rule(i))))
+        size = min(body.size, largest)
+        complete.append(law.complete(given, Setting(size, strength, rule(i), timestep, sharp)))
     return jax.tree.map(lambda *x: jnp.stack(x), *complete)

@@ -125,10 +125,11 @@ class Scene(eqx.Module):
         gravity = checked_array("gravity", gravity, (3,))
         # Before the bodies are prepared, which makes new ones.
         twins = twins_of(bodies)
-        bodies, contacts = prepared(bodies, contacts, gravity)
+        bodies, contacts = prepared(bodies, contacts, timestep, gravity)
         rest = None
         if others is not None:
-            bodies, rest = others_of(bodies, contacts, (*joints, *loops), apart, others, gravity)
+            joined = (*joints, *loops)
+            bodies, rest = others_of(bodies, contacts, joined, apart, others, timestep, gravity)
         check_materials(bodies, others, apart)
         if contacts or rest is not None:
             warn_of_long_steps(bodies, timestep, gravity)
