@@ -34,6 +34,10 @@ _STRONGEST = 100.0
 """Gravity [m/s²] beyond that of all planets, and of centrifuges for people."""
 _FAR = 3.0
 """Sizes from a body's middle at which an anchor, or a centre of mass, is rather given in another frame."""
+_WIDEST_EDGE = 1.0
+"""Share of a shape's thickness from which the smooth edge reaches through it."""
+_SHORTEST = 1e-7
+"""Timestep [s] below which it is rather given in another unit."""
 _TURNS = 10.0
 """Whole numbers beyond these, as limits of a hinge, are rather degrees [rad]."""
 _LEAPS = 10.0
@@ -194,6 +198,10 @@ def _of_body(body: Body) -> list[Doubt]:
         )
         found.append(Doubt(3, text))
     thin = _thickness(body)
+    edge = getattr(body.shape, "edge", None)
+    if edge is not None and not is_traced(edge) and float(edge) > _WIDEST_EDGE * thin:
+        text = f"the edge of {body.name!r} is {float(edge):.3g} m wide and its shape {thin:.3g} m thick"
+        found.append(Doubt(3, f"{text}: it has no inside"))
     if thin < _THINNEST * body.size:
         text = f"{body.name!r} is {thin:.2g} m thick and {body.size:.2g} m long: too thin for its samples"
         found.append(Doubt(5, text))
@@ -296,11 +304,30 @@ def doubts_of_state(
         names = ", ".join(repr(bodies[i].name) for i in layout.free[:3])
         text = f"orientation [0, 0, 0, 1] of {names} is a half turn about z: quaternions are wxyz"
         found.append(Doubt(4, f"{text}, and no turn is [1, 0, 0, 0]"))
+    found += _of_coordinates(bodies, layout, state)
+    if timestep < _SHORTEST:
+        text = (
+            f"timestep {timestep:.3g} s is short: a second takes {1 / timestep:.2g} steps; is it in seconds?"
+        )
+        found.append(Doubt(3, text))
     for i, body in enumerate(bodies):
         if body.fixed and (np.any(speeds[i]) or np.any(spins[i])):
             found.append(Doubt(3, f"{body.name!r} is fixed: the velocity of its state moves nothing"))
     for i, j in pairs:
         found += _begins_inside(bodies, position, orientation, i, j)
+    return found
+
+
+def _of_coordinates(bodies: Sequence[Body], layout: Layout, state: State) -> list[Doubt]:
+    """Angles of hinges that are rather in degrees."""
+    found = []
+    for joint, _, place in layout.dofs:
+        if state.q is None or layout.kinds[joint] != "hinge" or layout.follows[joint]:
+            continue
+        q = float(state.q[place])
+        if abs(q) > _TURNS and q == round(q):
+            name, turns = bodies[layout.children[joint]].name, abs(q) / (2 * np.pi)
+            found.append(Doubt(4, f"q of {name!r} is {q:g} rad, {turns:.3g} turns: is it in degrees?"))
     return found
 
 
