@@ -54,7 +54,7 @@ def test_episodes_are_those_of_single_environments(pushed, env):
             assert reward == pytest.approx(rewards[i], rel=1e-5, abs=1e-6)
             assert done[i] == (met or over)
             assert infos[i]["reached"] == info["reached"]
-            assert infos[i]["errors"]["puck"] == pytest.approx(info["errors"]["puck"])
+            assert infos[i]["errors"] == pytest.approx(info["errors"])
             if not done[i]:
                 np.testing.assert_allclose(seen[i], last, atol=1e-12)
                 continue

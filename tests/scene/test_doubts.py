@@ -107,7 +107,7 @@ def test_a_centre_of_mass_of_another_frame_is_said():
     for com, said in (((0.02, 0, 0), 0), ((1.0, 0, 0), 1)):
         body = dano.Body("ball", dano.Sphere(0.1), mass=1.0, com=com)
         found = said_of(lambda body=body: dano.Scene.create([body]))
-        assert ["the centre of mass of 'ball' lies 0.9 m beside" in text for text in found] == [True] * said
+        assert ["the centre of mass of 'ball' lies 0.899 m beside" in text for text in found] == [True] * said
 
 
 def test_traced_numbers_are_not_judged():
