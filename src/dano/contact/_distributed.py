@@ -187,9 +187,7 @@ def _slow(gravity: Float[Q, ""], size: Any) -> Float[AnyArray, ""]:
 
 
 @by_numpy
-def _sharp_depth(
-    gravity: Float[Q, ""], timestep: Float[Q, ""], depth: Float[Q, ""]
-) -> Float[AnyArray, ""]:
+def _sharp_depth(gravity: Float[Q, ""], timestep: Float[Q, ""], depth: Float[Q, ""]) -> Float[AnyArray, ""]:
     """Depth of an impact [m] where surfaces are known exactly, from that of others.
 
     A body that is held is taken to fall until it meets others, within a step by g h²: that is no impact.
