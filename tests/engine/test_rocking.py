@@ -65,7 +65,7 @@ def test_the_factor_converges_with_the_step():
 
 
 def test_where_contact_is_sharp():
-    """Between boxes, cylinders and half-spaces; not where a body is round, or impacts are left to a spring."""
+    """Between boxes, cylinders and half-spaces; not where a body is round, or a spring has impacts."""
     cylinder, ball = dano.Cylinder(0.05, 0.05), dano.Sphere(0.05)
 
     def params(shape, law=None, timestep=1e-3, **given):

@@ -192,8 +192,8 @@ class Body(eqx.Module):
     def is_sharp(self, other: "Body") -> bool:
         """Whether the surface is known exactly where the body touches another one.
 
-        Those of boxes without rounding, of cylinders and of half-spaces are. Of a neural object of flat faces the
-        samples are but not the solid, on which those of a half-space, which has none, do not press.
+        Those of boxes without rounding, of cylinders and of half-spaces are. Of a neural object of flat faces
+        the samples are but not the solid; a half-space has no samples that press on it.
         """
         if self.object is not None:
             return isinstance(other.shape, HalfSpace) and self.object.is_flat
