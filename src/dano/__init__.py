@@ -110,7 +110,12 @@ from dano.planning import (
     SamplingOptions as SamplingOptions,
     Task as Task,
 )
-from dano.scene_file import load_object as load_object, load_scene as load_scene
+from dano.scene_file import (
+    build_parts as build_parts,
+    load_object as load_object,
+    load_scene as load_scene,
+    Part as Part,
+)
 from dano.exchange import export_object as export_object, export_robot as export_robot
 
 from dano.names import keep_old_name as _keep_old_name

@@ -169,13 +169,16 @@ class Build:
 
     Attributes:
         field: Density grid (.npz with values, origin, spacing), voxels (.npy), mesh (.obj, .stl, …), object
-            (.dano), a shipped one (bunny, soap, …), or what `dano import` reads.
+            (.dano), a shipped one (bunny, soap, …), or what `dano import` reads. Or a part of one object: a
+            mesh with its density [kg/m³] or mass, as blade.ply:7850 or grip.ply:0.3kg.
+        further: Its other parts, in the same frame and units.
         output: Where to write the object, usually *.dano.
         options: How to make it.
         json: Print one JSON object instead of text.
     """
 
     field: Positional[Path]
+    further: Positional[tuple[Path, ...]] = ()
     output: Output = UNNAMED
     options: Annotated[BuildOptions, arg(name="")] = BuildOptions()
     json: bool = False

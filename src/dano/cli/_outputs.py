@@ -87,7 +87,9 @@ def free_path(path: Path, *, taken: Sequence[Path] = (), keep: bool = True) -> P
 
 def _stem(source: Path | str) -> str:
     """Name of an input without its folder and endings; of a function package.module:name its name."""
-    path = Path(str(source).rpartition(":")[2])
+    head, _, tail = str(source).rpartition(":")
+    # Behind a part of an object stands what it weighs, blade.ply:7850.
+    path = Path(head if head and tail[:1].isdigit() else tail)
     if path.name in ("transforms.json", "anno_train.json"):
         path = path.parent
     return path.absolute().name.split(".", 1)[0] or "dano"

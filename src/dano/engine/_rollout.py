@@ -136,9 +136,10 @@ def check_state(scene: Scene, state: State) -> None:
     """`Scene.check_state`, after the scene itself; and whether loops are closed.
 
     Raises:
-        ValueError: If the scene is not a `Scene`, the state does not fit it, or loops are open.
+        ValueError: If the scene is not a `Scene`, a mass is not known, the state does not fit it, or loops
+            are open.
     """
-    checked_kind("scene", scene, Scene)
+    checked_kind("scene", scene, Scene).check_weighed()
     scene.check_state(state)
     closing = scene.closing
     if closing is not None and state.position.ndim == 2 and not is_traced(state, scene):
