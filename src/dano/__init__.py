@@ -91,12 +91,16 @@ from dano.engine import (
 from dano.identification import (
     Identification as Identification,
     identify as identify,
+    identify_load as identify_load,
     IdentifyOptions as IdentifyOptions,
+    Load as Load,
     load_motion as load_motion,
+    load_wrist_log as load_wrist_log,
     Motion as Motion,
     motion_of_joints as motion_of_joints,
     Parameter as Parameter,
     save_motion as save_motion,
+    WristLog as WristLog,
 )
 from dano.planning import (
     Actuator as Actuator,
