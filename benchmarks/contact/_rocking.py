@@ -1,8 +1,8 @@
 """A block that rocks without rebound, against Housner (1963), The behavior of inverted pendulum structures.
 
 Each time its other edge lands, its spin falls to 1 − 3/2 sin²α of what it was, tan α = width/height. The
-factor is read from the heights of successive swings, so no velocity is looked at. The same landing is begun at
-several moments of a step.
+factor is read from the heights of successive swings, so no velocity is looked at. The same landing is begun
+at several moments of a step.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 import dano
 from benchmarks._measure import Row
-from benchmarks.contact._scenes import GRAVITY, milliseconds, on_floor
+from benchmarks.contact._scenes import Geometry, GRAVITY, milliseconds, on_floor
 
 GROUP = "A block that rocks: error of what a landing leaves of the spin (Housner 1963), from half the balance"
 PHASES = "The same landing begun at forty moments of a step: spread of what it leaves of the spin"
@@ -57,14 +57,16 @@ def rows(*, quick: bool) -> list[Row]:
     found = []
     for h in steps:
         for ratio in ratios:
-            errors = []
-            for width in widths:
-                block = Block(width / 2, ratio * width / 2)
-                kept = factors(block, h, np.array([0.5 * block.balance]))
-                errors.append(100 * abs(kept[0] / block.factor - 1))
+            errors = [_error(Block(width / 2, ratio * width / 2), h) for width in widths]
             name = f"height/width {ratio}, {len(widths)} sizes, {milliseconds(h)}"
             note = ", ".join(f"{e:.2g}" for e in errors)
             found.append(Row(GROUP, name, max(errors), "%", TARGET, note=note))
+    for ratio in ratios:
+        block = Block(WIDTH / 2, ratio * WIDTH / 2)
+        geometry = _learned(block)
+        for h in steps:
+            name = f"neural object, height/width {ratio}, {milliseconds(h)}"
+            found.append(Row(GROUP, name, _error(block, h, geometry), "%", TARGET))
     for h in steps:
         for ratio in ratios[:4]:
             block = Block(WIDTH / 2, ratio * WIDTH / 2)
@@ -79,15 +81,36 @@ def rows(*, quick: bool) -> list[Row]:
     return found
 
 
-def factors(block: Block, timestep: float, begins: np.ndarray) -> np.ndarray:
-    """By what the first landing multiplies the spin, from angles at which a block is let go [rad]."""
+def _learned(block: Block) -> dano.NeuralObject:
+    """A neural object of a block."""
+    box = dano.Box((block.b, block.b, block.h))
+    return dano.NeuralObject.from_field(box, mass=1.0, n_samples=2000, resolution=64, mass_model="solid")
+
+
+def _error(block: Block, timestep: float, geometry: Geometry | None = None) -> float:
+    """Of the factor of a landing that begins at half the angle of balance [%]."""
+    kept = factors(block, timestep, np.array([0.5 * block.balance]), geometry)
+    return float(100 * abs(kept[0] / block.factor - 1))
+
+
+def factors(
+    block: Block, timestep: float, begins: np.ndarray, geometry: Geometry | None = None
+) -> np.ndarray:
+    """By what the first landing multiplies the spin, from angles at which a block is let go [rad].
+
+    Args:
+        block: The block.
+        timestep: h [s].
+        begins: The angles.
+        geometry: Of the block; a box if not given.
+    """
     b, h = block
     depth = b
     mass = 1000 * 8 * b * h * depth
     inertia = np.diag([b * b + h * h, depth * depth + h * h, depth * depth + b * b]) * mass / 3
     scene = on_floor(
-        dano.Box((depth, b, h)), timestep, mass=mass, properties={"inertia": inertia}, sliding_friction=1.0,
-        restitution=0.0,
+        geometry or dano.Box((depth, b, h)), timestep, mass=mass,
+        properties={"inertia": inertia, "com": np.zeros(3)}, sliding_friction=1.0, restitution=0.0,
     )  # fmt: skip
     # From half the angle of balance it lands after arcosh(2) = 1.3 times this.
     seconds = 4.0 * np.sqrt(4 / 3 * np.hypot(b, h) / GRAVITY)

@@ -38,7 +38,9 @@ def rows(*, quick: bool) -> list[Row]:
     found = []
     for mu in frictions:
         for h in steps:
-            found += _curve(f"cube, friction {mu:g}, {1e3 * h:g} ms", _cube(), mu, h, starts, (90.0, 60.0, 5.0))
+            found += _curve(
+                f"cube, friction {mu:g}, {1e3 * h:g} ms", _cube(), mu, h, starts, (90.0, 60.0, 5.0)
+            )
     for name in SHAPES[:1] if quick else SHAPES:
         mu, h = OF_SHAPES
         found += _curve(f"{name}, friction {mu:g}, {1e3 * h:g} ms", _body(name), mu, h, starts, (90, 50, 10))

@@ -27,8 +27,8 @@ CHUNK = 16
 SINKING = 0.005
 IMPACT_DEPTH = 0.005
 """Depth of an impact over the size of the smaller body, at default."""
-# Where surfaces are known exactly: share by which a body sinks, and least depth of an impact over that of others.
-# A face that closes over a cushion lands row by row, and a cascade of small impacts loses less than one.
+# Where surfaces are known exactly: share by which a body sinks, and least depth of an impact over that of
+# others. A face that closes over a cushion lands row by row: many small impacts lose less than one.
 _SHARP_SINKING, _SHARP_DEPTH = 1e-6, 2e-3
 # Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
 _SLOW = 0.2

@@ -17,7 +17,7 @@ from dano.keys import folded_key, split_key
 from dano.maths import checked_array, checked_key, checked_points, floating, is_traced, Numbers
 from dano.memory import check_nodes
 from dano.notebook import card, cloud, numbers
-from dano.objects._flats import flattened
+from dano.objects._flats import flat_share, flattened
 from dano.objects._interior import examine, Interior, is_distance, sealed
 from dano.objects._mass import (
     check_scale,
@@ -42,6 +42,9 @@ from dano.objects._surface import draw_surface, equal_areas, SurfaceSamples
 
 MassModel = Literal["auto", "density", "solid"]
 FORMAT, VERSION = OBJECT
+
+_FLAT = 0.95
+"""Share of the surface of a body of flat faces that is flat, at least."""
 
 _MOST_SAMPLES = 200_000
 """As many contact samples take two minutes and 3 GB; a hundredth of them do for most purposes."""
@@ -255,6 +258,14 @@ class NeuralObject(eqx.Module):
     def size(self) -> float:
         """Largest extent of the samples [m]."""
         return float(np.ptp(np.asarray(self.samples.points), axis=0).max())
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether nearly all of the surface are flat faces, whose samples lie on their planes."""
+        solid, surface = self.solid, self.surface
+        if not isinstance(solid, SignedDistanceGrid) or is_traced(surface.points, solid.spacing):
+            return False
+        return flat_share(surface, solid.spacing) > _FLAT
 
     def save(self, path: str | os.PathLike[str], *, look: Mapping[str, np.ndarray] | None = None) -> None:
         """Write the object to one file (a zip of arrays, no pickle), replacing another only when complete.

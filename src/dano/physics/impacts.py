@@ -45,8 +45,8 @@ class Impact:
         share: β, share of the contact that is an impact and no lasting contact [1].
         stiffness: κ [Pa s/m], zero where bodies have not sunk in far enough.
         depth: δ [m].
-        factor: F, momentum that the damper passes on, by that of the common mass, for each speed that is missing
-            [1]. The softer, the more samples share an impact; goals make up for it.
+        factor: F, momentum that the damper passes on, by that of the common mass, for each speed that is
+            missing [1]. The softer, the more samples share an impact; goals make up for it.
         deepest: Depth that another part of the body may have at the end of the step, where its impact is left
             to the next one [m].
         part: Share of the impact that the pair carries, ½ where samples of both bodies do [1].

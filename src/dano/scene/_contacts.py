@@ -126,7 +126,8 @@ def prepared(
         a, b = by_name[contact.a], by_name[contact.b]
         stiffness = functools.partial(_stiffness, a, b, weight, carried)
         size = min(sizes[a.name], sizes[b.name])
-        setting = Setting(size, strength, stiffness, timestep, a.is_sharp and b.is_sharp)
+        sharp = a.is_sharp(b) and b.is_sharp(a)
+        setting = Setting(size, strength, stiffness, timestep, sharp)
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
     return tuple(by_name[body.name] for body in bodies), tuple(completed)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from dano.fields import HalfSpace
 from dano.maths import is_traced, quat_rotate
+from dano.names import see
 from dano.scene._bodies import Body
 from dano.scene._contacts import Contact
 from dano.scene._frames import RESOLVED
@@ -354,5 +355,5 @@ def _begins_inside(
         depth = offset - float(((position[k] + turned) @ normal).min())
         if depth > _DEEP * float(_extents(body).min()):
             text = f"{body.name!r} begins {depth:.3g} m inside {floor.name!r}: it will be pushed out"
-            found.append(Doubt(1, text, "start"))
+            found.append(Doubt(1, f"{text}; {see('a-body-begins-inside-another')}", "start"))
     return found

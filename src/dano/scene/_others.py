@@ -94,7 +94,7 @@ def others_of(
         return tuple(bodies), None
     touching = {i for pair in pairs for i in pair}
     bodies = tuple(with_surface(body) if i in touching else body for i, body in enumerate(bodies))
-    return bodies, Others(_stacked(bodies, touching, law, params, timestep, gravity), law, tuple(pairs))
+    return bodies, Others(_stacked(bodies, pairs, law, params, timestep, gravity), law, tuple(pairs))
 
 
 def unnamed_contacts(
@@ -169,7 +169,7 @@ def _check_apart(bodies: Sequence[Body], apart: Sequence[tuple[str, str]]) -> No
 
 def _stacked(
     bodies: Sequence[Body],
-    touching: set[int],
+    pairs: Sequence[tuple[int, int]],
     law: DistributedLaw,
     usual: ContactParams,
     timestep: Float[Array, ""],
@@ -180,6 +180,7 @@ def _stacked(
     What does not move or has no end presses as softly, and is as large, as what it may meet: the other body
     decides.
     """
+    touching = {i for pair in pairs for i in pair}
     weight, strength = heaviest(bodies, gravity)
     moving = [i for i in touching if not bodies[i].fixed]
     largest = max(bodies[i].size for i in moving)
@@ -194,7 +195,7 @@ def _stacked(
         return lambda sinking: functools.reduce(jnp.minimum, [stiffness(k, sinking) for k in decide])
 
     # What is soft against one of them is so against all.
-    sharp = all(bodies[i].is_sharp for i in touching)
+    sharp = all(bodies[i].is_sharp(bodies[j]) and bodies[j].is_sharp(bodies[i]) for i, j in pairs)
     complete = []
     for i, body in enumerate(bodies):
         given = usual if body.material is None else body.material

@@ -30,8 +30,8 @@ _MARGIN = 0.001
 _SINK = 0.01
 # … and by this share of the thinner one's half thickness. Impacts are at most as deep.
 _THIN = 0.25
-# Momentum that the damper of an impact passes on, see `dano.physics.impacts.Impact`: half the size over the depth
-# of the impact, within bounds. Where that is shallow, what has sunk in has to stop all of what comes.
+# Momentum that the damper of an impact passes on, see `dano.physics.impacts.Impact`: half the size over the
+# depth of the impact, within bounds. Where that is shallow, what has sunk in has to stop all of what comes.
 _SOFTEST, _HARDEST = 100.0, 1e4
 # Another part of a body, whose impact is left to the next step, gets in by at most this share of the size.
 _DEEPEST = 0.04
