@@ -46,6 +46,7 @@ ODD = {
         toml(more=LATE.replace("[1, 0, 0]\nfrom = 2.0", "[3e4, 0, 0]")),
         "in newtons?",
     ),
+    "far away": (toml(body="position = [0, 0, 1e13]"), "where numbers are 0.002 m apart: is its position"),
     "a timestep in nanoseconds": (toml(top="timestep = 5e-9\nn_steps = 60"), "a second takes 2e+08 steps"),
     "controls too late": (toml(more=LATE), "1 never acts: it begins at 2 s, and 0.3 s are run"),
     "nothing touches": (toml(top=TOP + "\ncontacts = []"), "touches nothing"),

@@ -37,6 +37,8 @@ _FAR = 3.0
 """Sizes from a body's middle at which an anchor, or a centre of mass, is rather given in another frame."""
 _WIDEST_EDGE = 1.0
 """Share of a shape's thickness from which the smooth edge reaches through it."""
+_COARSE = 1e-3
+"""Share of a body's size by which places may be rounded."""
 _SHORTEST = 1e-7
 """Timestep [s] below which it is rather given in another unit."""
 _TURNS = 10.0
@@ -277,8 +279,14 @@ def doubts_of_state(
     found = []
     position, speeds = np.asarray(state.position, np.float64), np.asarray(state.velocity, np.float64)
     spins, orientation = np.asarray(state.omega, np.float64), np.asarray(state.orientation, np.float64)
+    rounding = float(np.finfo(state.position.dtype).eps)
     for i in layout.free:
         body = bodies[i]
+        far = float(np.abs(position[i]).max())
+        if np.isfinite(body.size) and far * rounding > _COARSE * body.size:
+            apart = f"where numbers are {far * rounding:.1g} m apart"
+            text = f"{body.name!r} lies {far:.3g} m from the origin, {apart}"
+            found.append(Doubt(2, f"{text}: is its position in metres?"))
         way = float(np.linalg.norm(speeds[i])) * timestep
         if np.isfinite(body.size) and way > _LEAPS * body.size and way > 0:
             found.append(
