@@ -137,12 +137,13 @@ def _too_soft(contact: Contact, bodies: Sequence[Body], gravity: Float[Array, "3
         if is_traced(body.surface, body.mass, body.mass_scale, body.scale) or not np.isfinite(body.size):
             continue
         weight = float(body.mass * body.mass_scale) * float(np.linalg.norm(np.asarray(gravity)))
+        other = contact.b if body.name == contact.a else contact.a
         if float(stiffness) * body.typical_support(_SOFT * body.size) < weight:
             found.append(
                 Doubt(
                     3,
                     f"{body.name!r} sinks by more than {100 * _SOFT:.0f} % of its size where it rests: its"
-                    f" stiffness of {float(stiffness):.3g} Pa/m with {contact.a!r} or {contact.b!r} is small",
+                    f" stiffness of {float(stiffness):.3g} Pa/m with {other!r} is small",
                 )
             )
     return found
