@@ -92,3 +92,22 @@ def paths(
         axis.set_xlabel("mm")
     axes[0].legend(fontsize=6, loc="best", frameon=False)
     return saved(figure, path)
+
+
+def tools(
+    path: Path, panels: Sequence[tuple[str, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
+) -> Path:
+    """Outlines of tools, with their centres of mass: true, of their parts, of one material."""
+    figure, axes = figure_of(len(panels), width=2.2, height=2.2)
+    for axis, (name, points, true, parts, one) in zip(axes, panels, strict=True):
+        # The two directions in which it is longest.
+        first, second = np.argsort(-np.ptp(points, axis=0))[:2]
+        axis.plot(1e3 * points[:, second], 1e3 * points[:, first], ".", ms=1, color="#bbbbbb")
+        marks = ((one, OTHER, "x", "one material"), (parts, OURS, "o", "dano: parts"), (true, SEEN, "+", "true"))
+        for centre, colour, mark, label in marks:
+            axis.plot(1e3 * centre[second], 1e3 * centre[first], mark, color=colour, ms=7, label=label)
+        axis.set_title(name, fontsize=7)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_xlabel("mm")
+    axes[0].legend(fontsize=6, frameon=False)
+    return saved(figure, path)

@@ -1,6 +1,7 @@
 """Loads from a wrist's forces and torques, against bodies of a few point masses on a known path."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -205,3 +206,22 @@ def test_what_is_no_log_is_refused(clean, change, words):
 def test_positions_in_millimetres_are_refused(clean):
     with pytest.raises(ValueError, match="positions must be in metres"):
         dano.identify_load(dano.WristLog.create(**{**clean, "position": 1e3 * clean["position"]}))
+
+
+def test_the_command_prints_and_writes_it(tmp_path, noisy, capsys):
+    from dano.cli import main
+
+    columns = ["time", "x", "y", "z", "qw", "qx", "qy", "qz", "fx", "fy", "fz", "mx", "my", "mz"]
+    table = np.column_stack([noisy[k] if k != "times" else noisy[k][:, None] for k in ARRAYS])
+    path, out = tmp_path / "wrist.csv", tmp_path / "fit.json"
+    path.write_text(",".join(columns) + "\n" + "\n".join(",".join(f"{x:.9g}" for x in row) for row in table))
+    main(["identify", str(path), "-o", str(out)])
+    said, found = capsys.readouterr().out, json.loads(out.read_text())
+    assert "centre of mass" in said and "not observed" not in said
+    assert abs(found["mass"] / MASSES.sum() - 1) < 0.02 and found["unobserved"] == []
+    with pytest.raises(SystemExit):
+        main(["identify", str(path), "-p", "a.mass_scale:0:1"])
+    assert "leave out parameter" in capsys.readouterr().err
+
+
+ARRAYS = ("times", "position", "orientation", "force", "torque")
