@@ -1,9 +1,9 @@
 """Workshop tools of several materials: mass, centre and inertia from their parts, and from a wrist's log.
 
-The meshes, what their parts are made of, and their mass properties are those of the STARS Laboratory's workshop
-tools (MIT licence), from CAD. A mesh falls into its closed parts; which is of what material is listed here, from
-the largest down. Logs are computed from the true mass properties: a wrist that holds the tool by the data set's
-grasp shakes it for ten seconds, with noise and a bias in what it feels.
+The meshes, what their parts are made of, and their mass properties are those of the STARS Laboratory's
+workshop tools (MIT licence), from CAD. A mesh falls into its closed parts; which is of what material is
+listed here, from the largest down. Logs are computed from the true mass properties: a wrist that holds the
+tool by the data set's grasp shakes it for ten seconds, with noise and a bias in what it feels.
 """
 
 import ast
@@ -34,7 +34,17 @@ PARTS: dict[str, tuple[float, ...]] = {
     "Nut_Screwdriver": (PVC, STAINLESS),
     "Rubber_Mallet": (RUBBER, OAK),
     "Screwdriver": (PVC, STAINLESS),
-    "Vise_Clamp": (STAINLESS, STAINLESS, STAINLESS, STAINLESS, RUBBER, RUBBER, STAINLESS, STAINLESS, STAINLESS),
+    "Vise_Clamp": (
+        STAINLESS,
+        STAINLESS,
+        STAINLESS,
+        STAINLESS,
+        RUBBER,
+        RUBBER,
+        STAINLESS,
+        STAINLESS,
+        STAINLESS,
+    ),
 }
 """Densities of the closed parts of each tool, from the largest down. Of others no parts are told apart."""
 
@@ -115,7 +125,9 @@ def _from_parts(tools: list[Tool]) -> list[Row]:
     for k, (name, unit, target) in enumerate(names):
         low, middle, high = np.quantile(table[:, k], (0.25, 0.5, 0.75))
         note = f"worst {table[:, k].max():.2g}; nothing is fitted, {len(table)} tools"
-        found.append(Row(group, f"{name}, median error", middle, unit, target, quartiles=(low, high), note=note))
+        found.append(
+            Row(group, f"{name}, median error", middle, unit, target, quartiles=(low, high), note=note)
+        )
     for k, (name, unit) in enumerate((("centre of mass", "% of size"), ("inertia", "%"))):
         values = np.array(plain)[:, k]
         note = f"worst {values.max():.2g}"
@@ -124,7 +136,7 @@ def _from_parts(tools: list[Tool]) -> list[Row]:
 
 
 def built(tool: Tool) -> tuple[dano.NeuralObject, dano.objects.MassProperties]:
-    """The tool of its parts by `dano.build_parts`, and its mass properties as one material of the true mass."""
+    """The tool of its parts by `dano.build_parts`, and mass properties of one material of the true mass."""
     import trimesh
 
     mesh = trimesh.load(tool.mesh, process=True)
@@ -163,7 +175,9 @@ def built(tool: Tool) -> tuple[dano.NeuralObject, dano.objects.MassProperties]:
 def errors(tool: Tool, mass: dano.objects.MassProperties, size: float) -> tuple[float, float]:
     """Of the centre of mass [% of the size] and of the inertia about it [%]."""
     centre = 100 * float(np.linalg.norm(np.asarray(mass.com) - tool.com)) / size
-    inertia = 100 * float(np.linalg.norm(np.asarray(mass.inertia) - tool.inertia) / np.linalg.norm(tool.inertia))
+    inertia = 100 * float(
+        np.linalg.norm(np.asarray(mass.inertia) - tool.inertia) / np.linalg.norm(tool.inertia)
+    )
     return centre, inertia
 
 
@@ -191,7 +205,7 @@ def _from_logs(tools: list[Tool], seeds: int) -> list[Row]:
                 off[k] = 100 * float(np.linalg.norm(np.asarray(getattr(fit, name)) - value) / scale)
             each.append(off)
     table = np.array(each)
-    note = f"{count} logs of {SECONDS:g} s, noise {NOISE[0]:g} N and {NOISE[1]:g} N m; nothing is fitted beforehand"
+    note = f"{count} logs of {SECONDS:g} s, noise {NOISE[0]:g} N and {NOISE[1]:g} N m; nothing is fitted"
     found = []
     limits = (("mass", "%", None), ("centre", "% of size", 2.0), ("inertia", "%", 8.0))
     for k, (name, unit, target) in enumerate(limits):
@@ -201,7 +215,9 @@ def _from_logs(tools: list[Tool], seeds: int) -> list[Row]:
             continue
         low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
         said = f"{note}; worst {values.max():.2g}"
-        found.append(Row(group, f"{name}, median error", middle, unit, target, quartiles=(low, high), note=said))
+        found.append(
+            Row(group, f"{name}, median error", middle, unit, target, quartiles=(low, high), note=said)
+        )
         inside = 100 * held[k] / (count - lost[k])
         found.append(Row(group, f"{name}: 95 % intervals that hold the truth", inside, "%", 90.0, True))
         found.append(Row(group, f"{name}: logs that do not decide it", 100 * lost[k] / count, "%"))
@@ -270,5 +286,7 @@ def picture(source: Source, folder: Path) -> Path:
         tool = Tool.load(path)
         made, whole = built(tool)
         points = np.asarray(made.surface.points)
-        found.append((name.replace("_", " "), points, tool.com, np.asarray(made.mass.com), np.asarray(whole.com)))
+        found.append(
+            (name.replace("_", " "), points, tool.com, np.asarray(made.mass.com), np.asarray(whole.com))
+        )
     return tools(folder / "real_tools.png", found)

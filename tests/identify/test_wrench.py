@@ -184,7 +184,9 @@ def test_tables_are_read(tmp_path, noisy):
     log = dano.load_wrist_log(path)
     for field in dataclasses.fields(log):
         assert np.allclose(getattr(log, field.name), noisy[field.name], atol=1e-6)
-    path.write_text(",".join(columns[:-1]) + "\n" + "\n".join(",".join(f"{x:.9g}" for x in r[:-1]) for r in table))
+    path.write_text(
+        ",".join(columns[:-1]) + "\n" + "\n".join(",".join(f"{x:.9g}" for x in r[:-1]) for r in table)
+    )
     with pytest.raises(ValueError, match=r"columns of the torque, \['mz'\] are missing"):
         dano.load_wrist_log(path)
 

@@ -1,6 +1,7 @@
 """One object of several parts, each of a material or a mass of its own."""
 
 import dataclasses
+import itertools
 import os
 import re
 import warnings
@@ -50,8 +51,8 @@ class Part:
     """
 
     source: "str | os.PathLike[str] | AbstractShape"
-    density: float | None = None
-    mass: float | None = None
+    density: int | float | None = None
+    mass: int | float | None = None
 
     def __post_init__(self) -> None:
         """Check it.
@@ -108,7 +109,8 @@ def parts_of(texts: Sequence[str | os.PathLike[str]]) -> list[Part]:
     for text, part in zip(texts, found, strict=True):
         if part is None:
             raise ValueError(
-                f"{text} needs a density [kg/m³] or a mass, as the other parts have: {text}:7850 or {text}:0.3kg"
+                f"{text} needs a density [kg/m³] or a mass, as the other parts have: {text}:7850 or"
+                f" {text}:0.3kg"
             )
     return [part for part in found if part is not None]
 
@@ -137,7 +139,8 @@ def build_parts(
         progress: Called with a description and the share done.
 
     Raises:
-        ValueError: If a part is no solid, or overlaps another by more than a tenth of its volume, or options do
+        ValueError: If a part is no solid, or overlaps another by more than a tenth of its volume, or options
+        do
             not fit.
     """
     parts = checked_items("parts", parts, Part)
@@ -180,7 +183,7 @@ def build_parts(
 
 
 class _Weight(NamedTuple):
-    """Mass [kg], centre [m, F], inertia about it [kg m²] of a part, and standard errors of their integration."""
+    """Mass [kg], centre [m, F], inertia about it [kg m²] of a part, and errors of their integration."""
 
     mass: float
     com: np.ndarray
@@ -203,7 +206,9 @@ def _shapes(parts: Sequence[Part], options: BuildOptions, tell: Progress) -> lis
                 continue
             found[k], said[k] = _shape(part, {**options.of_file, "units": "mm"})
         first = parts[guessed.index(True)].name
-        said.append([f"all parts are read in millimetres, as {first} must be; units of BuildOptions says otherwise"])
+        said.append(
+            [f"all parts are read in millimetres, as {first} must be; units of BuildOptions says otherwise"]
+        )
     for text in dict.fromkeys(text for texts in said for text in texts):
         warnings.warn(text, UserWarning, stacklevel=3)
     return found
@@ -225,7 +230,7 @@ def _shape(part: Part, options: dict[str, Any]) -> tuple[AbstractShape, list[str
 
 
 def _joined(shapes: Sequence[AbstractShape]) -> AbstractShape:
-    """The union as one sampled distance: where parts meet, a spline has a normal, and the lesser of two has none."""
+    """The union as one sampled distance: a spline has normals where parts meet, a minimum has none."""
     if len(shapes) == 1:
         return shapes[0]
     boxes = np.array([np.asarray(shape.bounds, np.float64) for shape in shapes])
@@ -266,9 +271,7 @@ def _sum(weights: Sequence[_Weight], dtype) -> MassProperties:
     for weight in weights:
         arm = weight.com - com
         inertia += weight.inertia + weight.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    errors = [
-        np.sqrt(sum(np.asarray(weight.errors[k]) ** 2 for weight in weights)) for k in range(3)
-    ]
+    errors = [np.sqrt(sum(np.asarray(weight.errors[k]) ** 2 for weight in weights)) for k in range(3)]
     return MassProperties(
         jnp.asarray(mass, dtype),
         jnp.asarray(com, dtype),
@@ -286,7 +289,7 @@ def _fits(parts: Sequence[Part], shapes: Sequence[AbstractShape], size: float) -
         ValueError: If one overlaps another by much.
     """
     said, touches = [], np.eye(len(parts), dtype=bool)
-    for i, j in ((i, j) for i in range(len(parts)) for j in range(i + 1, len(parts))):
+    for i, j in itertools.combinations(range(len(parts)), 2):
         depth = [_share_within(shapes[i], shapes[j]), _share_within(shapes[j], shapes[i])]
         a, b = parts[i].name, parts[j].name
         inner = i if depth[0][0] >= depth[1][0] else j
@@ -295,11 +298,14 @@ def _fits(parts: Sequence[Part], shapes: Sequence[AbstractShape], size: float) -
         touches[i, j] = touches[j, i] = gap < _APART * size
         if share > _OVERLAPS:
             raise ValueError(
-                f"{a} and {b} overlap: {100 * share:.0f} % of {parts[inner].name} lies in the other part and would"
-                " weigh twice; cut it out of one of them (or check that their files share a frame and units)"
+                f"{a} and {b} overlap: {100 * share:.0f} % of {parts[inner].name} lies in the other part and"
+                " would weigh twice; cut it out of one of them (or check that their files share a frame and"
+                " units)"
             )
         if share > 0.05 * _OVERLAPS:
-            said.append(f"{a} and {b} overlap by {100 * share:.1f} % of {parts[inner].name}, which weighs twice")
+            said.append(
+                f"{a} and {b} overlap by {100 * share:.1f} % of {parts[inner].name}, which weighs twice"
+            )
     reached = touches[0]
     for _ in parts:
         reached = touches[reached].any(axis=0)

@@ -16,7 +16,8 @@ class Identify:
     Or mass, centre of mass and inertia of what a robot holds, from a log of its wrist's forces and torques.
 
     Attributes:
-        scene: Scene file (.toml). Or a wrist's log (.csv) with nothing else: time, the sensor's pose (x, y, z,
+        scene: Scene file (.toml). Or a wrist's log (.csv) with nothing else: time, the sensor's pose (x, y,
+        z,
             qw, qx, qy, qz), fx, fy, fz [N] and mx, my, mz [N m].
         motions: Observed motions (.npz, .csv, .txt, .tum): times [s], positions [m], quaternions. The guide
             "Identification" lists the columns.
