@@ -43,7 +43,8 @@ def test_both_restitutions_agree_without_friction():
     impacts = plates()
     arm = _points.arms(impacts.before[:, 2], _impacts.SEMI_AXES)
     both = [f(impacts.before[:, 3:], arm, 0.019, 0.6, 0.0) for f in (_points.newton, _points.poisson)]
-    assert np.allclose(*both, atol=0.02)
+    # A four-hundredth of the impulse, that is some millimetres per second and tenths of a radian per second.
+    assert (np.abs(both[0] - both[1]) / [1e-9, 0.02, 0.5]).max() < 1
     # Without friction nothing pushes along the floor, and energy falls.
     assert np.allclose(both[0][:, 0], impacts.before[:, 3])
     moment = _points.moment_left(impacts.before[:, 3:], both[0], arm, 0.019)

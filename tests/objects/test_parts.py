@@ -1,11 +1,13 @@
 """Objects of several parts, against sums in closed form."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 import dano
 from dano.building import BuildOptions
-from dano.scene_file import part_of, parts_of
+from dano.scene_file import materials_doubt, part_of, parts_of
 
 QUICK = BuildOptions(samples=200, resolution=32)
 
@@ -98,7 +100,27 @@ def test_meshes_are_read_in_one_unit(tmp_path):
     for name, sides, at in (("long", (10, 10, 60), 0.0), ("short", (15, 15, 10), 35.0)):
         trimesh.creation.box(sides).apply_translation((0, 0, at)).export(tmp_path / f"{name}.stl")
     parts = [dano.Part(tmp_path / "long.stl", density=1000), dano.Part(tmp_path / "short.stl", mass=0.1)]
-    with pytest.warns(UserWarning, match="all parts are read in millimetres"):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         made = dano.build_parts(parts, QUICK)
+    assert any("all parts are read in millimetres" in str(each.message) for each in caught)
     assert np.isclose(made.mass.mass, 0.106, rtol=1e-5)
     assert np.allclose(made.mass.com, [0, 0, 0.1 * 0.035 / 0.106], atol=1e-6)
+
+
+def test_parts_of_other_colours_are_asked_for(tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="needs the extra mesh")
+    pieces = []
+    for sides, at, colour in (((20, 20, 200), 0.0, (150, 90, 40)), ((80, 20, 20), 115.0, (60, 60, 60))):
+        piece = trimesh.creation.box(sides).apply_translation((0, 0, at))
+        piece.visual.vertex_colors = (*colour, 255)
+        pieces.append(piece)
+    trimesh.util.concatenate(pieces).export(tmp_path / "hammer.ply")
+    text = materials_doubt(tmp_path / "hammer.ply")
+    # 80 and 32 cm³ at 0 and 115 mm, of 225 mm: 115·(32·7850/(80·1100 + 32·7850) − 32/112) mm.
+    expected = 100 * 115 * (32 * 7850 / (80 * 1100 + 32 * 7850) - 32 / 112) / 225
+    assert text is not None and f"off by {expected:.0f} % of the size" in text
+    for piece in pieces:
+        piece.visual.vertex_colors = (60, 60, 60, 255)
+    trimesh.util.concatenate(pieces).export(tmp_path / "plain.ply")
+    assert materials_doubt(tmp_path / "plain.ply") is None

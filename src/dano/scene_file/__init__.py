@@ -25,6 +25,7 @@ from dano.scene_file._objects import (
 )
 from dano.scene_file._parts import (
     build_parts as build_parts,
+    materials_doubt as materials_doubt,
     Part as Part,
     part_of as part_of,
     parts_of as parts_of,

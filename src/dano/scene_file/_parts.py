@@ -34,6 +34,16 @@ _PROBES = 20_000
 _NODES, _MARGIN = (96, 256), 3
 """Least and most nodes along the longest side of several parts, and those around them."""
 
+_STEEL, _PLASTIC = 7850.0, 1100.0
+"""Densities [kg/m³] of what tools are made of, for what a doubt says."""
+
+_NOTABLE, _OTHER_COLOUR, _MOST_FACES = 0.01, 30.0, 300_000
+"""Least share of the volume of a part that counts, least difference of a colour of 255, and most faces: a
+second of work."""
+
+_COLOURED = (".ply", ".obj", ".off")
+"""Formats of single meshes whose faces or vertices may have colours."""
+
 _LIKELY = (10.0, 30_000.0)
 """Densities of solids [kg/m³]: from foams to above gold. What is beyond is likely in other units."""
 
@@ -180,6 +190,43 @@ def build_parts(
     total = _sum(weights, made.mass.mass.dtype)
     made = eqx.tree_at(lambda o: o.mass, made, total)
     return dataclasses.replace(made, mass_model="given", mass_reason=f"sum of {len(parts)} parts: {words}")
+
+
+def materials_doubt(path: Path) -> str | None:
+    """What to say of a mesh that is weighed as one material, but whose closed parts have different colours.
+
+    It says by how much the centre of mass may be off: were the largest part plastic and the rest steel, or
+    the other way round.
+    """
+    if path.suffix.lower() not in _COLOURED or not path.is_file():
+        return None
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, process=True)
+    except Exception:  # each of trimesh's readers raises its own kinds; it was read and mended before
+        return None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) > _MOST_FACES or not mesh.visual.defined:
+        return None
+    pieces = [piece for piece in mesh.split(only_watertight=True) if piece.volume > 0]
+    volumes = np.array([piece.volume for piece in pieces])
+    large = [k for k in range(len(pieces)) if volumes[k] > _NOTABLE * volumes.sum()]
+    colours = np.array([np.asarray(pieces[k].visual.face_colors)[:, :3].mean(axis=0) for k in large])
+    if len(large) < 2 or np.ptp(colours, axis=0).max() < _OTHER_COLOUR:
+        return None
+    volumes = volumes[large]
+    centres = np.array([pieces[k].center_mass for k in large])
+    same = volumes @ centres / volumes.sum()
+    shifts = []
+    for first, rest in ((_PLASTIC, _STEEL), (_STEEL, _PLASTIC)):
+        weights = volumes * np.where(np.arange(len(volumes)) == np.argmax(volumes), first, rest)
+        shifts.append(np.linalg.norm(weights @ centres / weights.sum() - same))
+    share = 100 * max(shifts) / float(np.max(mesh.extents))
+    return (
+        f"{path} has {len(large)} closed parts of different colours, and is weighed as one material: were the"
+        f" largest plastic and the rest steel, or the other way round, the centre of mass would be off by"
+        f" {share:.0f} % of the size; give them as files of their own, FILE:DENSITY each, or their masses"
+    )
 
 
 class _Weight(NamedTuple):
