@@ -8,9 +8,12 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from mktestdocs import grab_code_blocks
+
+from dano.names import Trouble, TROUBLES
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROGRAMS = {
@@ -99,6 +102,12 @@ def test_the_index_leads_to_every_page():
     # Parts of the benchmarks are listed on their own first page.
     parts = {name for name in linked("benchmarks.md") if name.startswith("benchmarks/")}
     assert linked("index.md") | parts == {str(p.relative_to(docs)) for p in docs.rglob("*.md")} - {"index.md"}
+
+
+def test_messages_name_headings_that_are_there():
+    page = (REPOSITORY / TROUBLES).read_text(encoding="utf-8")
+    headings = {heading.lower().replace(" ", "-") for heading in re.findall(r"^## (.+)$", page, re.MULTILINE)}
+    assert set(get_args(Trouble)) <= headings
 
 
 MENU = (REPOSITORY / "mkdocs.yml").read_text(encoding="utf-8")

@@ -122,7 +122,7 @@ spec = mujoco.MjSpec.from_string('''
   <body name="mug" pos="0 0 0.1"><freejoint/></body>
 </worldbody></mujoco>''')
 bridge = Bridge(spec)
-bridge.attach("mug", "mug.stl", mass=0.3, look=False)
+bridge.attach("mug", "mug.stl", look=False)
 model = bridge.compile()
 data = mujoco.MjData(model)
 with bridge:

@@ -103,6 +103,13 @@ def test_python_says_it_when_it_is_made():
         scene.initial_state(soap=dict(velocity=(1200, 0, 0)))
 
 
+def test_a_centre_of_mass_of_another_frame_is_said():
+    for com, said in (((0.02, 0, 0), 0), ((1.0, 0, 0), 1)):
+        body = dano.Body("ball", dano.Sphere(0.1), mass=1.0, com=com)
+        found = said_of(lambda body=body: dano.Scene.create([body]))
+        assert ["the centre of mass of 'ball' lies 0.899 m beside" in text for text in found] == [True] * said
+
+
 def test_traced_numbers_are_not_judged():
     soap = dano.Body("soap", dano.Box((0.045, 0.03, 0.02)), mass=0.15)
 
@@ -118,6 +125,11 @@ def test_links_with_a_mark_are_not_judged_by_it():
     link = dano.Body("link", dano.Sphere(0.01), mass=5.0, com=(0, 0, 0.2), inertia=0.1 * np.eye(3))
     joint = dano.Joint(None, "link", anchor=(0, 0, 0.5))
     assert said_of(lambda: dano.Scene.create([link], joints=[joint])) == []
+    # Heavy and small, or there only to carry others.
+    for mass in (0.3, 1e-11):
+        point = dano.Body("link", dano.Sphere(0.01), mass=mass)
+        assert said_of(lambda point=point: dano.Scene.create([point], joints=[joint])) == []
+        assert said_of(lambda point=point: dano.Scene.create([point]))
 
 
 def test_an_axis_and_an_angle_are_no_quaternion():

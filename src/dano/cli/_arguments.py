@@ -60,12 +60,6 @@ class Train:
     json: Path | None = None
     previews: Path | None = None
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _learn
-
-        _learn.train(self)
-
 
 @dataclass(frozen=True)
 class Poses:
@@ -127,12 +121,6 @@ class Poses:
     seed: int = 0
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _learn
-
-        _learn.poses(self)
-
 
 @dataclass(frozen=True)
 class Data:
@@ -156,12 +144,6 @@ class Data:
     table: float | None = None
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _learn
-
-        _learn.data(self)
-
 
 @dataclass(frozen=True)
 class Build:
@@ -182,12 +164,6 @@ class Build:
     output: Output = UNNAMED
     options: Annotated[BuildOptions, arg(name="")] = BuildOptions()
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _objects
-
-        _objects.build(self)
 
 
 @dataclass(frozen=True)
@@ -243,12 +219,6 @@ class Import:
     keep_transform: bool = False
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _import
-
-        _import.import_field(self)
-
 
 @dataclass(frozen=True)
 class Inspect:
@@ -266,12 +236,6 @@ class Inspect:
     png: Path | None = None
     no_png: bool = False
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _objects
-
-        _objects.inspect(self)
 
 
 @dataclass(frozen=True)
@@ -310,12 +274,6 @@ class Simulate:
     resume: bool = False
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _scenes
-
-        _scenes.simulate(self)
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -343,12 +301,6 @@ class Plan:
     slow_motion: float = 1.0
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import planning
-
-        planning.plan(self)
-
 
 @dataclass(frozen=True)
 class View:
@@ -368,12 +320,6 @@ class View:
     beside: Path | None = None
     page: Path | None = None
     port: int = 8080
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _scenes
-
-        _scenes.view(self)
 
 
 @dataclass(frozen=True)
@@ -411,12 +357,6 @@ class Export:
     texture_size: int = 1024
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _export
-
-        _export.export(self)
-
 
 @dataclass(frozen=True)
 class Compare:
@@ -448,12 +388,6 @@ class Compare:
     seed: int = 0
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _compare
-
-        _compare.compare(self)
-
 
 @dataclass(frozen=True)
 class Cache:
@@ -474,12 +408,6 @@ class Cache:
     limit: str | None = None
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _cache
-
-        _cache.cache(self)
-
 
 @dataclass(frozen=True)
 class Demo:
@@ -497,9 +425,3 @@ class Demo:
     output: Output = Path("dano-demo")
     draft: bool = False
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _scenes
-
-        _scenes.demo(self)

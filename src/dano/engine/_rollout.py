@@ -22,6 +22,7 @@ from dano.engine._finite import unsound
 from dano.engine._reports import Report, SolverOptions
 from dano.engine._rolling import rolled
 from dano.maths import by_numpy, is_traced, Q, quat_conjugate, quat_exp, quat_multiply
+from dano.names import see
 from dano.scene import coming_from, Control, Origin, RESOLVED, Scene, State, Trajectory
 
 # From here on reverse mode recomputes segments instead of keeping every step's residuals.
@@ -136,9 +137,10 @@ def check_state(scene: Scene, state: State) -> None:
     """`Scene.check_state`, after the scene itself; and whether loops are closed.
 
     Raises:
-        ValueError: If the scene is not a `Scene`, the state does not fit it, or loops are open.
+        ValueError: If the scene is not a `Scene`, a mass is not known, the state does not fit it, or loops
+            are open.
     """
-    checked_kind("scene", scene, Scene)
+    checked_kind("scene", scene, Scene).check_weighed()
     scene.check_state(state)
     closing = scene.closing
     if closing is not None and state.position.ndim == 2 and not is_traced(state, scene):
@@ -379,7 +381,8 @@ def _way_out(report: Report, failed: np.ndarray) -> str:
     """What may help steps that did not converge."""
     if report.overflow is not None and np.atleast_1d(np.asarray(report.overflow))[failed].all():
         return "more points touch than there is room for: take a larger VariationalEngine(capacity=…)"
-    return "try a smaller timestep, or with CentroidLaw a smaller damper or smoothing; see docs/troubles.md"
+    page = see("steps-did-not-converge")
+    return f"try a smaller timestep, or with CentroidLaw a smaller damper or smoothing; {page}"
 
 
 def _say(scene: Scene, following: State, report: Report) -> None:

@@ -1,16 +1,20 @@
 """What the files of kernels declare, read without running them: running them takes Warp, and seconds."""
 
-import ast
 import functools
 import importlib.util
 import re
 from pathlib import Path
 
-from dano.native._instances import Features, INSTANCED, making
+from dano.native._instances import Features, INSTANCED
 
 PACKAGES = (*INSTANCED, "dano.vision.drawing.kernels")
 """Packages of all modules of kernels."""
 _IMPORT = re.compile(r"^(?:from|import) (dano\.[\w.]+)", re.MULTILINE)
+# Python's own parser would do, but that of 3.11 fails where two threads parse at once, and Warp parses
+# whenever it likes. So this is what structures look like: fields, and branches of fields by a feature.
+_FROM = re.compile(r"^from (dano\.[\w.]+) import (\([^)]*\)|[^\n(]*)", re.MULTILINE)
+_DOCSTRING = re.compile(r'"""[\s\S]*?"""')
+_LINE = re.compile(r"^( +)(?:if (\w+):|(\w+):)", re.MULTILINE)
 
 
 @functools.cache
@@ -45,24 +49,25 @@ def fields_of(features: Features, module: str, structure: str) -> tuple[str, ...
     Raises:
         KeyError: If the module has no such structure.
     """
-    with making:
-        body = ast.parse(source_of(module)).body
-    for node in body:
-        if isinstance(node, ast.ClassDef) and node.name == structure:
-            return tuple(_fields(node.body, dict(features.values)))
-        if isinstance(node, ast.ImportFrom) and node.module is not None:
-            for name in node.names:
-                if (name.asname or name.name) == structure:
-                    return fields_of(features, node.module, name.name)
+    text = source_of(module)
+    found = re.search(rf"^class {structure}\b.*\n((?:[ \t].*\n|\n)*)", text, re.MULTILINE)
+    if found is not None:
+        return tuple(_fields(_DOCSTRING.sub("", found[1]), dict(features.values)))
+    for imported, names in _FROM.findall(text):
+        for name in names.strip("()").split(","):
+            words = name.split()
+            if words and words[-1] == structure:
+                return fields_of(features, imported, words[0])
     raise KeyError(f"{module} has no structure {structure}")
 
 
-def _fields(body: list[ast.stmt], features: dict[str, object]) -> list[str]:
-    found = []
-    for node in body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            found.append(node.target.id)
-        elif isinstance(node, ast.If) and isinstance(node.test, ast.Name):
+def _fields(body: str, features: dict[str, object]) -> list[str]:
+    """Fields in the body of a class, and in those of its branches by features that are taken."""
+    found, taken = [], True
+    for indent, condition, name in _LINE.findall(body):
+        if len(indent) == 4:
             # A field that only some builds have, under the name of the feature.
-            found += _fields(node.body if features[node.test.id] else node.orelse, features)
+            taken = bool(features[condition]) if condition else name != "else" or not taken
+        if taken and not condition and name != "else":
+            found.append(name)
     return found

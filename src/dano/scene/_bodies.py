@@ -9,7 +9,16 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_optional, checked_text
 from dano.contact import Collider, ContactParams, SampleSet, Support, SurfaceSet
-from dano.fields import AbstractField, AbstractShape, Ellipsoid, HalfSpace, SignedDistanceGrid, Sphere
+from dano.fields import (
+    AbstractField,
+    AbstractShape,
+    Box,
+    Cylinder,
+    Ellipsoid,
+    HalfSpace,
+    SignedDistanceGrid,
+    Sphere,
+)
 from dano.hosted import hosted
 from dano.maths import (
     AnyArray,
@@ -17,6 +26,7 @@ from dano.maths import (
     checked_array,
     checked_quaternion,
     floating,
+    is_traced,
     library,
     Numbers,
     Q,
@@ -38,7 +48,10 @@ LAYER = 0.02
 
 # Quantities of a start, and how many numbers each has; of joints as many as they have coordinates.
 _START = {"position": 3, "origin": 3, "orientation": 4, "velocity": 3, "omega": 3, "q": None, "v": None}
-_ARGUMENTS = (*_START, "mass", "inertia", "com", "mass_scale", "com_offset", "material", "gravcomp", "fixed")
+_ARGUMENTS = (
+    *_START,
+    *"mass inertia com mass_scale com_offset material gravcomp fixed weighed".split(),
+)
 
 
 class Body(eqx.Module):
@@ -64,6 +77,7 @@ class Body(eqx.Module):
         material: Contact parameters for pairs that no contact of a scene names; None: the scene's.
         gravcomp: Share of the weight that is held, as by a spring balance [1]; None: none.
         fixed: Whether the body never moves.
+        weighed: Whether its mass is known (static).
         start: Where `Scene.initial_state` puts it if nothing else is said: some of `position, orientation,
             velocity, omega, origin, q, v`.
     """
@@ -84,6 +98,7 @@ class Body(eqx.Module):
     material: ContactParams | None
     gravcomp: Float[Array, ""] | None
     fixed: bool = eqx.field(static=True)
+    weighed: bool = eqx.field(static=True)
     start: dict[str, Array]
 
     def __init__(
@@ -99,6 +114,7 @@ class Body(eqx.Module):
         material: ContactParams | None = None,
         gravcomp: Numbers | None = None,
         fixed: bool = False,
+        weighed: bool = True,
         **start: Numbers | None,
     ):
         """A body from a neural object (which brings its mass) or a shape (homogeneous, of the given mass).
@@ -116,6 +132,8 @@ class Body(eqx.Module):
             gravcomp: Share of the weight that is held: 1 and gravity does not pull at the body, more and it
                 rises. As MuJoCo's.
             fixed: Whether the body never moves; then it needs no mass.
+            weighed: Whether the mass is known. A scene with a body that moves and whose mass stands for one
+                that nobody knows serves kinematics alone: it is not stepped.
             **start: Where it starts if `Scene.initial_state` is not told otherwise: `position` of the centre
                 of mass, or `origin` of the field frame [m, W], `orientation` (wxyz), `velocity` [m/s, W],
                 `omega` [rad/s, B]; on a joint `q` and `v`.
@@ -126,7 +144,7 @@ class Body(eqx.Module):
         """
         keep_programs()
         self.name = checked_text("name", name)
-        self.fixed = bool(fixed)
+        self.fixed, self.weighed = bool(fixed), bool(weighed)
         self.material = checked_optional(f"material of body {name!r}", material, ContactParams)
         self.samples = self.support = self.surface = self.extent = self.object = self.shape = None
         self.density_scale = floating(1.0)
@@ -167,8 +185,7 @@ class Body(eqx.Module):
         if self.object is not None:
             return self.object.size
         assert self.shape is not None
-        extent = np.ptp(np.asarray(self.shape.bounds), axis=0)
-        return float(extent.max())
+        return float(np.ptp(np.asarray(self.shape.bounds), axis=0).max())
 
     @property
     def field(self) -> AbstractField | None:
@@ -179,6 +196,18 @@ class Body(eqx.Module):
     def solid(self) -> AbstractShape | None:
         """What other bodies' surface samples press on: the shape, or the object's signed distance."""
         return self.shape if self.object is None else self.object.solid
+
+    def is_sharp(self, other: "Body") -> bool:
+        """Whether the surface is known exactly where the body touches another one.
+
+        Those of boxes without rounding, of cylinders and of half-spaces are. Of a neural object of flat faces
+        the samples are but not the solid; a half-space has no samples that press on it.
+        """
+        if self.object is not None:
+            return isinstance(other.shape, HalfSpace) and self.object.is_flat
+        if isinstance(self.shape, Box):
+            return not is_traced(self.shape.rounding) and float(self.shape.rounding) == 0
+        return isinstance(self.shape, Cylinder | HalfSpace)
 
     @property
     def centre_of_mass(self) -> Float[Array, "3"]:

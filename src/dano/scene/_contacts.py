@@ -93,7 +93,10 @@ class Contact(eqx.Module):
 
 
 def prepared(
-    bodies: Sequence[Body], contacts: Sequence[Contact], gravity: Float[Array, "3"]
+    bodies: Sequence[Body],
+    contacts: Sequence[Contact],
+    timestep: Float[Array, ""],
+    gravity: Float[Array, "3"],
 ) -> tuple[tuple[Body, ...], tuple[Contact, ...]]:
     """Bodies with the samples that their contacts need, and contacts with all defaults filled in.
 
@@ -122,7 +125,9 @@ def prepared(
     for contact in contacts:
         a, b = by_name[contact.a], by_name[contact.b]
         stiffness = functools.partial(_stiffness, a, b, weight, carried)
-        setting = Setting(min(sizes[a.name], sizes[b.name]), strength, stiffness)
+        size = min(sizes[a.name], sizes[b.name])
+        sharp = a.is_sharp(b) and b.is_sharp(a)
+        setting = Setting(size, strength, stiffness, timestep, sharp)
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
     return tuple(by_name[body.name] for body in bodies), tuple(completed)

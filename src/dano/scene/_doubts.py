@@ -1,12 +1,12 @@
 """What is odd about a scene or a state, and hints at other units, another frame or a slip: said once.
 
 Every doubt is a test of numbers that are there anyway. None is made of traced values. Bodies whose inertia is
-that of something larger than their shape, such as links with a mark, are not judged by their shape.
+that of something larger than their shape are not judged by their shape, nor are links that touch nothing.
 """
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import jax
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from dano.fields import HalfSpace
 from dano.maths import is_traced, quat_rotate
+from dano.names import see
 from dano.scene._bodies import Body
 from dano.scene._contacts import Contact
 from dano.scene._frames import RESOLVED
@@ -33,7 +34,7 @@ _NO_LENGTHS = ("normal", "offset", "rounding")
 _STRONGEST = 100.0
 """Gravity [m/s²] beyond that of all planets, and of centrifuges for people."""
 _FAR = 3.0
-"""Sizes from a body's middle at which an anchor is rather given in another frame."""
+"""Sizes from a body's middle at which an anchor, or a centre of mass, is rather given in another frame."""
 _TURNS = 10.0
 """Whole numbers beyond these, as limits of a hinge, are rather degrees [rad]."""
 _LEAPS = 10.0
@@ -78,8 +79,20 @@ def doubts_of_scene(
     joints: Sequence[Joint],
     contacts: Sequence[Contact],
     gravity: Float[Array, "3"],
+    meeting: Collection[str],
 ) -> list[Doubt]:
-    """What is odd about what stays constant."""
+    """What is odd about what stays constant.
+
+    Args:
+        bodies: All bodies.
+        joints: All joints.
+        contacts: Those that are named.
+        gravity: [m/s²].
+        meeting: Names of the bodies that may touch something. The shape of what hangs on a joint, or carries
+            one, and touches nothing is only seen: a mark of a link, mostly.
+    """
+    linked = {name for joint in joints for name in (joint.parent, joint.child)}
+    seen = linked - set(meeting)
     found = []
     if len(bodies) > 1 and all(body.fixed for body in bodies):
         found.append(Doubt(2, "nothing moves: all bodies are fixed"))
@@ -92,12 +105,13 @@ def doubts_of_scene(
             found.append(Doubt(3, f"{text} has: it is a ratio of forces, not an angle"))
         found += _too_soft(contact, bodies, gravity)
     for body in bodies:
-        if not body.fixed and not is_traced(body.shape, body.mass, body.mass_scale, body.inertia):
+        traced = is_traced(body.shape, body.mass, body.mass_scale, body.inertia)
+        if not body.fixed and not traced and body.name not in seen:
             found += _of_body(body)
     by_name = {body.name: body for body in bodies}
     for joint in joints:
         if not is_traced(joint):
-            found += _of_joint(joint, by_name)
+            found += _of_joint(joint, None if joint.child in seen else by_name[joint.child])
     if not is_traced(gravity) and float(np.linalg.norm(np.asarray(gravity))) > _STRONGEST:
         strength = float(np.linalg.norm(np.asarray(gravity)))
         found.append(Doubt(1, f"gravity is {strength:.4g} m/s²: that of the earth is 9.81"))
@@ -154,10 +168,16 @@ def density_doubt(body: Body) -> str | None:
 
 
 def _extents(body: Body) -> Float[np.ndarray, "3"]:
+    return np.ptp(_bounds(body), axis=0)
+
+
+def _bounds(body: Body) -> Float[np.ndarray, "2 3"]:
+    """Lower and upper corner of the box around a body [m, F]."""
     if body.object is not None:
-        return np.ptp(np.asarray(body.object.surface.points, np.float64), axis=0)
+        points = np.asarray(body.object.surface.points, np.float64)
+        return np.stack([points.min(axis=0), points.max(axis=0)])
     assert body.shape is not None
-    return np.ptp(np.asarray(body.shape.bounds, np.float64), axis=0)
+    return np.asarray(body.shape.bounds, np.float64)
 
 
 def _of_body(body: Body) -> list[Doubt]:
@@ -168,11 +188,26 @@ def _of_body(body: Body) -> list[Doubt]:
         found.append(Doubt(0, text))
     elif _LONGEST < body.size < np.inf:
         found.append(Doubt(0, f"{body.name!r} is {body.size:.3g} m long: are its lengths in metres?"))
+    if (away := _beside(body)) > _FAR * body.size:
+        text = (
+            f"the centre of mass of {body.name!r} lies {away:.3g} m beside its shape, {away / body.size:.2g}"
+            " times its size: it is a point of the body's own frame"
+        )
+        found.append(Doubt(3, text))
     thin = _thickness(body)
     if thin < _THINNEST * body.size:
         text = f"{body.name!r} is {thin:.2g} m thick and {body.size:.2g} m long: too thin for its samples"
         found.append(Doubt(5, text))
     return found
+
+
+def _beside(body: Body) -> float:
+    """How far the centre of mass lies beside the box around a body [m]; 0 of what has none or is endless."""
+    if not np.isfinite(body.size) or is_traced(body.com):
+        return 0.0
+    low, high = _bounds(body)
+    com = np.asarray(body.com, np.float64)
+    return float(np.linalg.norm(np.maximum(0, np.maximum(low - com, com - high))))
 
 
 def _thickness(body: Body) -> float:
@@ -181,8 +216,9 @@ def _thickness(body: Body) -> float:
     return min((2 * float(np.min(np.asarray(getattr(body.shape, name)))) for name in names), default=np.inf)
 
 
-def _of_joint(joint: Joint, bodies: dict[str, Body]) -> list[Doubt]:
-    found, body = [], bodies[joint.child]
+def _of_joint(joint: Joint, body: Body | None) -> list[Doubt]:
+    """Limits in degrees, and anchors far from a body; None for one that is not judged by its shape."""
+    found = []
     if joint.kind == "hinge" and joint.limits is not None:
         ends = np.asarray(joint.limits, np.float64)
         finite = ends[np.isfinite(ends)]
@@ -196,6 +232,8 @@ def _of_joint(joint: Joint, bodies: dict[str, Body]) -> list[Doubt]:
                     f" {turns:.3g} turns: are they in degrees?",
                 )
             )
+    if body is None:
+        return found
     shown = body.shape if body.object is None else body.object.solid
     # A robot's link may hang on an axis far from what it is seen by.
     if shown is not None and np.isfinite(body.size) and is_homogeneous(body) and not is_traced(body.com):
@@ -290,5 +328,5 @@ def _begins_inside(
         depth = offset - float(((position[k] + turned) @ normal).min())
         if depth > _DEEP * float(_extents(body).min()):
             text = f"{body.name!r} begins {depth:.3g} m inside {floor.name!r}: it will be pushed out"
-            found.append(Doubt(1, text, "start"))
+            found.append(Doubt(1, f"{text}; {see('a-body-begins-inside-another')}", "start"))
     return found

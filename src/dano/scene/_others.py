@@ -56,6 +56,7 @@ def others_of(
     joints: Sequence[Joint | Loop],
     apart: Sequence[tuple[str, str]],
     params: ContactParams,
+    timestep: Float[Array, ""],
     gravity: Float[Array, "3"],
 ) -> tuple[tuple[Body, ...], Others | None]:
     """The bodies with what contact needs of them, and the pairs that are left; None if there are none.
@@ -66,6 +67,7 @@ def others_of(
         joints: And loops: what joins needs not touch.
         apart: Names of further pairs that do not touch.
         params: What bodies without a material of their own are made of.
+        timestep: h [s].
         gravity: [m/s², W].
 
     Raises:
@@ -92,7 +94,7 @@ def others_of(
         return tuple(bodies), None
     touching = {i for pair in pairs for i in pair}
     bodies = tuple(with_surface(body) if i in touching else body for i, body in enumerate(bodies))
-    return bodies, Others(_stacked(bodies, touching, law, params, gravity), law, tuple(pairs))
+    return bodies, Others(_stacked(bodies, pairs, law, params, timestep, gravity), law, tuple(pairs))
 
 
 def unnamed_contacts(
@@ -167,9 +169,10 @@ def _check_apart(bodies: Sequence[Body], apart: Sequence[tuple[str, str]]) -> No
 
 def _stacked(
     bodies: Sequence[Body],
-    touching: set[int],
+    pairs: Sequence[tuple[int, int]],
     law: DistributedLaw,
     usual: ContactParams,
+    timestep: Float[Array, ""],
     gravity: Float[Array, "3"],
 ) -> ContactParams:
     """Complete parameters of all bodies as arrays.
@@ -177,6 +180,7 @@ def _stacked(
     What does not move or has no end presses as softly, and is as large, as what it may meet: the other body
     decides.
     """
+    touching = {i for pair in pairs for i in pair}
     weight, strength = heaviest(bodies, gravity)
     moving = [i for i in touching if not bodies[i].fixed]
     largest = max(bodies[i].size for i in moving)
@@ -190,8 +194,11 @@ def _stacked(
         decide = [i] if i in moving else moving
         return lambda sinking: functools.reduce(jnp.minimum, [stiffness(k, sinking) for k in decide])
 
+    # What is soft against one of them is so against all.
+    sharp = all(bodies[i].is_sharp(bodies[j]) and bodies[j].is_sharp(bodies[i]) for i, j in pairs)
     complete = []
     for i, body in enumerate(bodies):
         given = usual if body.material is None else body.material
-        complete.append(law.complete(given, Setting(min(body.size, largest), strength, rule(i))))
+        size = min(body.size, largest)
+        complete.append(law.complete(given, Setting(size, strength, rule(i), timestep, sharp)))
     return jax.tree.map(lambda *x: jnp.stack(x), *complete)

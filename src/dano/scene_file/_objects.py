@@ -114,7 +114,11 @@ def _built_of(
 
     def build() -> Built:
         file = source if isinstance(source, str) else Path(source)
-        field = load_field(file, **({} if options is None else options.of_file))
+        with warnings.catch_warnings():
+            if options is not None and options.length is not None:
+                # A length makes up for it.
+                warnings.filterwarnings("ignore", message=".*no spacing was given")
+            field = load_field(file, **({} if options is None else options.of_file))
         chosen = _usual(isinstance(field, AbstractShape)) if options is None else options
         return _made(field, chosen, dashes, progress)
 

@@ -78,9 +78,3 @@ class Identify:
     filming: OmitArgPrefixes[Filming] = Filming()
     resume: bool = False
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli.identifying import _run
-
-        _run.identify(self)

@@ -8,7 +8,13 @@ import warp as wp
 
 from dano.physics.features import KINDS, UNIONS
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
-from dano.physics.solids.grids import closest_in_grid, coarse_bound, grid_distance, place_in_grid
+from dano.physics.solids.grids import (
+    closest_in_grid,
+    coarse_bound,
+    grid_distance,
+    grid_value,
+    place_in_grid,
+)
 from dano.physics.solids.kinds import GRID
 from dano.physics.solids.leaves import Distance, Leaf, LeafKind, Solids
 from dano.physics.solids.shapes import shape_distance
@@ -53,7 +59,6 @@ def leaf_clearance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: ve
     Beyond a grid's border its distance d adds the way b to the border, which is more than the true distance:
     the solid lies in the grid, so √(d² + b²) bounds that from below, and so does b.
     """
-    way = ZERO
     if wp.static(GRID in KINDS):
         if kind.kind == _GRID:
             y = (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position))
@@ -65,12 +70,12 @@ def leaf_clearance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: ve
             bound = leaf.factor * coarse_bound(solids, world, kind, closest)
             if way > ZERO:
                 bound = wp.sqrt(wp.max(bound, ZERO) * wp.max(bound, ZERO) + way * way)
-            if bound > enough:
-                return bound
-    d = leaf_distance(solids, world, kind, leaf, x).value
-    if way > ZERO:
-        d = wp.sqrt((d - way) * (d - way) + way * way)
-    return d
+            if bound <= enough:
+                bound = leaf.factor * grid_value(solids, world, kind, closest)
+                if way > ZERO:
+                    bound = wp.sqrt(bound * bound + way * way)
+            return bound
+    return leaf_distance(solids, world, kind, leaf, x).value
 
 
 @wp.func

@@ -36,6 +36,8 @@ _MEDIUM_STEPS = 128
 _TRACING, _PAINTING = "dano.vision.drawing.kernels.tracing", "dano.vision.drawing.kernels.painting"
 # Kernels for all scenes: they are compiled once.
 _FEATURES = Features(WIDE=False)
+# Rays that a thread traces together: `tracing.BLOCK`, which is asked for only where kernels are compiled.
+_BLOCK = 16
 # So few rays are not worth a second core, else each has some shares of them.
 _FEW, _SHARES = 512, 4
 
@@ -108,8 +110,13 @@ class Tracer:
         }
         self._numbers = {f"view.{name}": value for name, value in {"origin": origin, **numbers}.items()}
 
-    def __call__(self, directions: Float[np.ndarray, "3 n"]) -> Met:
-        """What rays of some unit directions [W] meet."""
+    def __call__(self, directions: Float[np.ndarray, "3 n"], regular: int = 0) -> Met:
+        """What rays of some unit directions [W] meet.
+
+        Args:
+            directions: Of the rays; neighbours share much of the work if they stand together.
+            regular: How many of them, from the first on, come in blocks of 4 × 4 pixels: see `pixel_order`.
+        """
         n = directions.shape[1]
         rays = np.ascontiguousarray(directions.T, np.float32)
         depth, which = np.empty(n, np.float32), np.empty(n, np.int32)
@@ -120,7 +127,8 @@ class Tracer:
         )
         written = (rays, depth, which, normals, lamp, ambient)
         names = ("directions", "depths", "which", "normals", "lamp", "ambient")
-        _launch(self._kernel, self._arrays, self._numbers, dict(zip(names, written, strict=True)))
+        of_rays = {f"rays.{name}": values for name, values in zip(names, written, strict=True)}
+        _launch(self._kernel, self._arrays, self._numbers, of_rays, block=_BLOCK, regular=regular)
         return Met(depth, which, np.ascontiguousarray(normals.T), lamp, ambient)
 
 
@@ -162,6 +170,19 @@ class Painter:
         return np.ascontiguousarray(colours.T), picture
 
 
+def pixel_order(width: int, height: int) -> tuple[Int[np.ndarray, " pixels"], int]:
+    """Indices of the pixels of a picture, neighbours together, and how many of them come in whole blocks.
+
+    Blocks have 4 × 4 pixels in Morton order; what is left at the right and lower border comes last.
+    """
+    y, x = np.mgrid[:height, :width]
+    left = (y >= height // 4 * 4) | (x >= width // 4 * 4)
+    inner = (x % 2) + 2 * (y % 2) + 4 * (x // 2 % 2) + 8 * (y // 2 % 2)
+    blocks = (y // 16) * (width // 16 + 1) + x // 16
+    order = np.lexsort([each.ravel() for each in (inner, x // 4, y // 4, blocks, left)])
+    return order, int(np.sum(~left))
+
+
 def compile_kernels() -> None:
     """Compile what draws, or load it; so that others may compile something else meanwhile."""
     _kernel(_PAINTING, "paint")
@@ -182,19 +203,24 @@ def _launch(
     shared: Mapping[str, np.ndarray],
     numbers: Mapping[str, Any],
     of_rays: Mapping[str, np.ndarray],
+    *,
+    block: int = 1,
+    regular: int | None = None,
 ) -> None:
-    """Launch a kernel of a ray a thread on all cores.
+    """Launch a kernel on all cores.
 
     Args:
         kernel: The kernel.
         shared: Arrays that all rays read, by place.
         numbers: Numbers and vectors by place.
         of_rays: Arrays with a row for each ray.
+        block: How many rays a thread has.
+        regular: `rays.regular`, if the kernel asks for it.
     """
     n = len(next(iter(of_rays.values())))
     # Neighbouring shares cost different times: several for each core make all end together.
     count = min(max(n // _FEW, 1), 1 if n_cores() == 1 else _SHARES * n_cores())
-    ends = [n * (k + 1) // count for k in range(count)]
+    ends = [n * (k + 1) // count // block * block for k in range(count - 1)] + [n]
     works = []
     for begin, end in zip([0, *ends[:-1]], ends, strict=True):
         if end == begin:
@@ -204,7 +230,9 @@ def _launch(
             parameters.show(place, values)
         for place, value in numbers.items():
             parameters.put(place, value)
-        works.append(Launch(kernel, parameters, end - begin))
+        if regular is not None:
+            parameters.put("rays.regular", max(min(regular, end) - begin, 0))
+        works.append(Launch(kernel, parameters, -(-(end - begin) // block)))
     if works:
         together([functools.partial(_each, works[k :: n_cores()]) for k in range(min(n_cores(), len(works)))])
 

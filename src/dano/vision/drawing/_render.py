@@ -7,6 +7,7 @@ kind of edge at a small part of the cost of doing so everywhere.
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,9 +22,18 @@ from dano.native import together
 from dano.vision.capture import AbstractCamera, Camera
 from dano.vision.drawing._composed import part_of, radiance, reached_through, through
 from dano.vision.drawing._item import checked_colour, Item, placement
-from dano.vision.drawing._rays import CHUNK, compile_kernels, Met, Painter, Thing, Tracer, transmitted
+from dano.vision.drawing._rays import (
+    CHUNK,
+    compile_kernels,
+    Met,
+    Painter,
+    pixel_order,
+    Thing,
+    Tracer,
+    transmitted,
+)
 from dano.vision.drawing._shade import GAMMA, lamps_of, Surroundings, to_picture
-from dano.vision.radiance import Sampling, tiles
+from dano.vision.radiance import Sampling
 
 # Half the angular width of the lamp [rad]: shadows are crisp where things touch and soft a length away.
 _LAMP = 0.07
@@ -130,12 +140,15 @@ def render(
     checked_kind("camera", camera, AbstractCamera)
     surroundings = _surroundings(camera, _focus(camera, items), light, background)
     view = _View(items, camera, surroundings, floor, shadows)
-    order, directions = _rays_of(camera)
-    drawn, touched = _drawn(view, directions)
+    rays = _rays_of(camera)
+    order = rays.order
+    drawn, touched = _drawn(view, rays.directions, rays.regular)
     picture = np.empty((len(order), 3), dtype=np.uint8)
     picture[order] = drawn
     if antialias and touched.any():
         edges = _edges(picture, order[touched], camera.width, camera.height)
+        # Neighbours together.
+        edges = edges[np.argsort(rays.rank[edges])]
         for start in range(0, len(edges), _AT_ONCE):
             part = edges[start : start + _AT_ONCE]
             points = np.stack([part % camera.width, part // camera.width], axis=1)[:, None] + 0.5 + _WITHIN
@@ -145,11 +158,27 @@ def render(
     return picture.reshape(camera.height, camera.width, 3)
 
 
-_kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+class _Rays(NamedTuple):
+    """A ray for each pixel of a picture.
+
+    Attributes:
+        order: Its pixel (n,).
+        rank: The ray of each pixel (n,).
+        regular: See `pixel_order`.
+        directions: Unit vectors [W] (3, n).
+    """
+
+    order: Int[np.ndarray, " n"]
+    rank: Int[np.ndarray, " n"]
+    regular: int
+    directions: Float[np.ndarray, "3 n"]
 
 
-def _rays_of(camera: AbstractCamera) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "3 n"]]:
-    """Pixel and unit direction [W] of each ray of a picture.
+_kept: dict[bytes, _Rays] = {}
+
+
+def _rays_of(camera: AbstractCamera) -> _Rays:
+    """The rays of a picture.
 
     Directions in the axes of the camera are kept from the last call: pictures come in series from cameras
     that differ in where they are.
@@ -160,14 +189,14 @@ def _rays_of(camera: AbstractCamera) -> tuple[Int[np.ndarray, " n"], Float[np.nd
     kind = np.round(camera.directions(probes) @ axes.T, 9)
     key = np.array([width, height, *kind.ravel()]).tobytes()
     if key not in _kept:
-        order = tiles(width, height)
+        order, regular = pixel_order(width, height)
         points = np.stack([order % width, order // width], axis=1) + 0.5
         own = np.ascontiguousarray((camera.directions(points) @ axes.T).T, dtype=np.float32)
         # One is enough: pictures come in series.
         _kept.clear()
-        _kept[key] = order, own
-    order, own = _kept[key]
-    return order, axes.T.astype(np.float32) @ own
+        _kept[key] = _Rays(order, np.argsort(order), regular, own)
+    kept = _kept[key]
+    return kept._replace(directions=axes.T.astype(np.float32) @ kept.directions)
 
 
 def _surroundings(
@@ -234,9 +263,11 @@ def prepare(items: Sequence[Item], camera: AbstractCamera) -> None:
     )
 
 
-def _drawn(view: _View, d: np.ndarray) -> tuple[UInt8[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Picture of rays, and which of them see more than empty surroundings."""
-    met = view.tracer(d)
+def _drawn(
+    view: _View, d: np.ndarray, regular: int = 0
+) -> tuple[UInt8[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Picture of rays, and which of them see more than empty surroundings; `regular` as `Tracer` takes it."""
+    met = view.tracer(d, regular)
     if view.cloud_parts:
         _darken_by_clouds(view, d, met)
     touched = (met.which >= len(view.planes)) | (met.lamp < 1) | (met.ambient < 1)
