@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -268,7 +267,7 @@ def _shape(part: Part, options: dict[str, Any]) -> tuple[AbstractShape, list[str
         return part.source, []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        shape = load_field(part.source, **options)
+        shape = load_field(Path(part.source), **options)
     if not isinstance(shape, AbstractShape):
         raise ValueError(
             f"{part.name} must be a mesh to be a part with a density, got {shown(shape)}: it has its own"
@@ -299,10 +298,15 @@ def _joined(shapes: Sequence[AbstractShape]) -> AbstractShape:
 def _weight(part: Part, shape: AbstractShape, options: BuildOptions) -> _Weight:
     moments = shape.solid_moments()
     if moments is None:
-        scale = {"mass": part.mass} if part.density is None else {"mass_scale": part.density}
-        mass = MassProperties.from_field(shape, resolution=options.resolution, key=jax.random.key(0), **scale)
-        errors = (float(mass.mass_error), np.asarray(mass.com_error), np.asarray(mass.inertia_error))
-        return _Weight(float(mass.mass), np.asarray(mass.com), np.asarray(mass.inertia), errors)
+        found = MassProperties.from_field(
+            shape,
+            mass=None if part.mass is None else float(part.mass),
+            mass_scale=1.0 if part.density is None else float(part.density),
+            resolution=options.resolution,
+            key=seed_key(options.seed),
+        )
+        errors = (float(found.mass_error), np.asarray(found.com_error), np.asarray(found.inertia_error))
+        return _Weight(float(found.mass), np.asarray(found.com), np.asarray(found.inertia), errors)
     volume = float(moments.volume)
     mass = part.mass if part.mass is not None else float(part.density or 0.0) * volume
     second = np.asarray(moments.second_moment, float) * mass / volume
@@ -353,7 +357,7 @@ def _fits(parts: Sequence[Part], shapes: Sequence[AbstractShape], size: float) -
             said.append(
                 f"{a} and {b} overlap by {100 * share:.1f} % of {parts[inner].name}, which weighs twice"
             )
-    reached = touches[0]
+    reached: np.ndarray = touches[0]
     for _ in parts:
         reached = touches[reached].any(axis=0)
     if not reached.all():

@@ -70,8 +70,9 @@ def _numbers(found: Load) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    array = np.asarray(value)
-    return np.where(np.isfinite(array), array, None).tolist()
+    array = np.asarray(value, dtype=object)
+    array[~np.isfinite(np.asarray(value, np.float64))] = None
+    return array.tolist()
 
 
 def _tell(found: Load, command: Identify) -> None:
