@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import dano
 from benchmarks._measure import Row, skipped
 from benchmarks.real._data import NO_DATA, Source
 from dano.building import BuildOptions
-from dano.maths import quat_from_matrix
 
 STEEL, STAINLESS, ALLOY, BRASS, PVC, RUBBER = 7800.0, 7800.0, 7700.0, 8500.0, 1300.0, 1000.0
 OAK = 560.0  # what the hammer's mass leaves for its handle
@@ -98,7 +98,7 @@ def rows(source: Source | None, *, quick: bool = False) -> list[Row]:
     tools = [Tool.load(path) for path in sorted((folder / "tools").iterdir()) if path.is_dir()]
     if quick:
         tools = [tool for tool in tools if tool.name in ("Machinist_Hammer", "Nut_Screwdriver")]
-    return [*_from_parts(tools), *_from_logs(tools, 2 if quick else 10)]
+    return [*_from_parts(tools), *_from_logs(tools, 2 if quick else 5)]
 
 
 def _from_parts(tools: list[Tool]) -> list[Row]:
@@ -248,7 +248,7 @@ def wrist_log(mass: float, centre: np.ndarray, inertia: np.ndarray, seed: int) -
     readings = np.concatenate([np.einsum("tji,tj->ti", turns[0], x) for x in (force, torque)], axis=1)
     random = np.random.default_rng(seed)
     readings = readings + BIAS + random.normal(size=readings.shape) * np.repeat(NOISE, 3)
-    quaternions = np.array([np.asarray(quat_from_matrix(turn)) for turn in turns[0]])
+    quaternions = Rotation.from_matrix(turns[0]).as_quat()[:, [3, 0, 1, 2]]
     return dano.WristLog.create(
         times, position=_place(times), orientation=quaternions, force=readings[:, :3], torque=readings[:, 3:]
     )
@@ -259,16 +259,12 @@ def _place(t: np.ndarray) -> np.ndarray:
 
 
 def _turn(t: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
     angles = 0.5 * np.stack([np.sin(5.1 * t), np.sin(6.7 * t + 1), np.sin(4.3 * t + 2)], axis=-1)
     return Rotation.from_euler("XYZ", angles).as_matrix()
 
 
 def _momentum(before: np.ndarray, after: np.ndarray, inertia: np.ndarray, step: float) -> np.ndarray:
     """Angular momentum of a body that turns from one orientation to another in a step [W]."""
-    from scipy.spatial.transform import Rotation
-
     vectors = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec() / step
     middle = before @ Rotation.from_rotvec(0.5 * step * vectors).as_matrix()
     return np.einsum("tij,tj->ti", middle, vectors @ inertia.T)

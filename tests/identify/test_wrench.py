@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import dano
-from dano.maths import quat_from_matrix
 
 POINTS = np.array([[0.02, 0.01, 0.05], [-0.03, 0.02, 0.12], [0.01, -0.04, 0.2], [0.0, 0.03, 0.16]])
 MASSES = np.array([0.4, 0.2, 0.5, 0.3])
@@ -27,6 +27,11 @@ def turn(t: np.ndarray) -> np.ndarray:
     y = stack([[np.cos(b), none, np.sin(b)], [none, one, none], [-np.sin(b), none, np.cos(b)]])
     z = stack([[np.cos(c), -np.sin(c), none], [np.sin(c), np.cos(c), none], [none, none, one]])
     return x @ y @ z
+
+
+def quaternions_of(rotations: np.ndarray) -> np.ndarray:
+    """Wxyz, shape (n, 4)."""
+    return Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
 
 
 def place(t: np.ndarray) -> np.ndarray:
@@ -50,7 +55,7 @@ def recorded(seconds=8.0, rate=250.0, points=POINTS, noise=(0.0, 0.0), still=Fal
     back = np.swapaxes(rotation(t), 1, 2)
     readings = np.concatenate([np.einsum("tij,tj->ti", back, x) for x in (force, torque)], axis=1) + BIAS
     readings += np.random.default_rng(seed).normal(size=readings.shape) * np.repeat(noise, 3)
-    quaternions = np.array([np.asarray(quat_from_matrix(r)) for r in rotation(t)])
+    quaternions = quaternions_of(rotation(t))
     return dict(
         times=t, position=path(t), orientation=quaternions, force=readings[:, :3], torque=readings[:, 3:]
     )
@@ -121,7 +126,7 @@ def test_slow_turns_decide_mass_and_centre_but_no_inertia(noisy):
     mass, centre, _ = truth()
     readings = np.concatenate([mass * down, np.cross(mass * centre, down)], axis=1)
     readings += np.random.default_rng(1).normal(size=readings.shape) * np.repeat((0.5, 0.02), 3)
-    quaternions = np.array([np.asarray(quat_from_matrix(r)) for r in slow])
+    quaternions = quaternions_of(slow)
     log = dano.WristLog.create(t, orientation=quaternions, force=readings[:, :3], torque=readings[:, 3:])
     found = dano.identify_load(log)
     assert found.unobserved == ("inertia",)
