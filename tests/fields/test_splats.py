@@ -9,13 +9,29 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
+import dano
 from dano.fields import load_field, read_splats, Splats
 from dano.fields.readers._gaussians import harmonics
 from dano.maths import Pose
+from dano.objects import fill_hollows, node_values
 
 pytest.importorskip("plyfile")
 RADIUS, CENTRE = 0.05, np.array([0.2, -0.1, 0.06])
 BOX = (0.14, -0.16, 0.005, 0.26, -0.04, 0.12)
+
+
+def test_a_foot_that_nobody_saw_is_closed():
+    # A hollow cup of 40 × 40 × 40 nodes, open below, beside its solid.
+    shape = np.zeros((48, 48, 48))
+    shape[4:44, 4:44, 4:44] = 1
+    hollow = shape.copy()
+    hollow[7:41, 7:41, :41] = 0
+    grid = dano.GridField(hollow, (0, 0, 0), 0.01, "linear")
+    assert fill_hollows(grid)[1].cavity < 0.01
+    closed, before = fill_hollows(grid, stood=True)
+    assert before.cavity > 0.5
+    middle = node_values(closed)[8:40, 8:40, 8:40]
+    np.testing.assert_allclose(middle, middle.max(), rtol=0.1)
 
 
 def even(n: int) -> np.ndarray:

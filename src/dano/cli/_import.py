@@ -65,7 +65,8 @@ def import_field(command: Import) -> None:
         field, error = bake(field, nodes, interpolation=interpolation, progress=progress)
     filled = 0.0
     if splats and not command.hollow and isinstance(field, GridField):
-        field, before = fill_hollows(field)
+        cut = command.box is not None or command.sphere is not None
+        field, before = fill_hollows(field, stood=cut)
         filled = float(before.cavity)
     progress.close()
     if command.to:
