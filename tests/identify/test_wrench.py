@@ -1,12 +1,13 @@
 """Loads from a wrist's forces and torques, against bodies of a few point masses on a known path."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import dano
-from dano.maths import quat_from_matrix
 
 POINTS = np.array([[0.02, 0.01, 0.05], [-0.03, 0.02, 0.12], [0.01, -0.04, 0.2], [0.0, 0.03, 0.16]])
 MASSES = np.array([0.4, 0.2, 0.5, 0.3])
@@ -26,6 +27,11 @@ def turn(t: np.ndarray) -> np.ndarray:
     y = stack([[np.cos(b), none, np.sin(b)], [none, one, none], [-np.sin(b), none, np.cos(b)]])
     z = stack([[np.cos(c), -np.sin(c), none], [np.sin(c), np.cos(c), none], [none, none, one]])
     return x @ y @ z
+
+
+def quaternions_of(rotations: np.ndarray) -> np.ndarray:
+    """Wxyz, shape (n, 4)."""
+    return Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
 
 
 def place(t: np.ndarray) -> np.ndarray:
@@ -49,7 +55,7 @@ def recorded(seconds=8.0, rate=250.0, points=POINTS, noise=(0.0, 0.0), still=Fal
     back = np.swapaxes(rotation(t), 1, 2)
     readings = np.concatenate([np.einsum("tij,tj->ti", back, x) for x in (force, torque)], axis=1) + BIAS
     readings += np.random.default_rng(seed).normal(size=readings.shape) * np.repeat(noise, 3)
-    quaternions = np.array([np.asarray(quat_from_matrix(r)) for r in rotation(t)])
+    quaternions = quaternions_of(rotation(t))
     return dict(
         times=t, position=path(t), orientation=quaternions, force=readings[:, :3], torque=readings[:, 3:]
     )
@@ -120,7 +126,7 @@ def test_slow_turns_decide_mass_and_centre_but_no_inertia(noisy):
     mass, centre, _ = truth()
     readings = np.concatenate([mass * down, np.cross(mass * centre, down)], axis=1)
     readings += np.random.default_rng(1).normal(size=readings.shape) * np.repeat((0.5, 0.02), 3)
-    quaternions = np.array([np.asarray(quat_from_matrix(r)) for r in slow])
+    quaternions = quaternions_of(slow)
     log = dano.WristLog.create(t, orientation=quaternions, force=readings[:, :3], torque=readings[:, 3:])
     found = dano.identify_load(log)
     assert found.unobserved == ("inertia",)
@@ -183,7 +189,9 @@ def test_tables_are_read(tmp_path, noisy):
     log = dano.load_wrist_log(path)
     for field in dataclasses.fields(log):
         assert np.allclose(getattr(log, field.name), noisy[field.name], atol=1e-6)
-    path.write_text(",".join(columns[:-1]) + "\n" + "\n".join(",".join(f"{x:.9g}" for x in r[:-1]) for r in table))
+    path.write_text(
+        ",".join(columns[:-1]) + "\n" + "\n".join(",".join(f"{x:.9g}" for x in r[:-1]) for r in table)
+    )
     with pytest.raises(ValueError, match=r"columns of the torque, \['mz'\] are missing"):
         dano.load_wrist_log(path)
 
@@ -205,3 +213,22 @@ def test_what_is_no_log_is_refused(clean, change, words):
 def test_positions_in_millimetres_are_refused(clean):
     with pytest.raises(ValueError, match="positions must be in metres"):
         dano.identify_load(dano.WristLog.create(**{**clean, "position": 1e3 * clean["position"]}))
+
+
+def test_the_command_prints_and_writes_it(tmp_path, noisy, capsys):
+    from dano.cli import main
+
+    columns = ["time", "x", "y", "z", "qw", "qx", "qy", "qz", "fx", "fy", "fz", "mx", "my", "mz"]
+    table = np.column_stack([noisy[k] if k != "times" else noisy[k][:, None] for k in ARRAYS])
+    path, out = tmp_path / "wrist.csv", tmp_path / "fit.json"
+    path.write_text(",".join(columns) + "\n" + "\n".join(",".join(f"{x:.9g}" for x in row) for row in table))
+    main(["identify", str(path), "-o", str(out)])
+    said, found = capsys.readouterr().out, json.loads(out.read_text())
+    assert "centre of mass" in said and "not observed" not in said
+    assert abs(found["mass"] / MASSES.sum() - 1) < 0.02 and found["unobserved"] == []
+    with pytest.raises(SystemExit):
+        main(["identify", str(path), "-p", "a.mass_scale:0:1"])
+    assert "leave out parameter" in capsys.readouterr().err
+
+
+ARRAYS = ("times", "position", "orientation", "force", "torque")

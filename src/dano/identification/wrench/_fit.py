@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dano.checks import checked_kind
-from dano.identification.wrench._log import twists, Twists, WristLog
+from dano.identification.wrench._log import Twists, twists, WristLog
 from dano.maths import checked_numbers, Numbers, quat_conjugate, quat_rotate
 from dano.objects import MassProperties
 
@@ -133,7 +133,8 @@ def identify_load(log: WristLog, *, gravity: Numbers = (0.0, 0.0, -9.81)) -> Loa
         other = _fitted(_Rows.of(log.of_sensor(), moved, pull))
         if other.noise[0] < _BETTER * fit.noise[0]:
             raise ValueError(
-                "force and torque must be in the sensor's axes: those of this log fit in world axes, with a noise"
+                "force and torque must be in the sensor's axes: those of this log fit in world axes, with"
+                " a noise"
                 f" of {other.noise[0]:.2g} N in place of {fit.noise[0]:.2g} N; frame='world' reads them so"
             )
     rows, fit = _drifting(rows, fit, messages)
@@ -237,7 +238,8 @@ def _drifting(rows: _Rows, fit: _Fit, messages: list[str]) -> tuple[_Rows, _Fit]
     drifting = _fitted(longer)
     change = drifting.theta[16:22]
     messages.append(
-        f"the bias drifts, by {np.linalg.norm(change[:3]):.2g} N and {np.linalg.norm(change[3:]):.2g} N m over the"
+        f"the bias drifts, by {np.linalg.norm(change[:3]):.2g} N and {np.linalg.norm(change[3:]):.2g} N m"
+        f" over the"
         " log: estimated along with the rest"
     )
     return longer, drifting
@@ -255,7 +257,8 @@ def _check(log: WristLog, rows: _Rows, fit: _Fit) -> None:
         return
     if (far := float(np.linalg.norm(arm / mass))) > _FAR:
         raise ValueError(
-            f"torques must be in N m: with these the centre of mass is {far:.3g} m from the sensor; divide N mm by"
+            f"torques must be in N m: with these the centre of mass is {far:.3g} m from the sensor;"
+            f" divide N mm by"
             " 1000"
         )
     _check_units(rows, fit)
@@ -269,7 +272,8 @@ def _check(log: WristLog, rows: _Rows, fit: _Fit) -> None:
     if best > _STRONG and (way := float(np.linalg.norm(shift))) > _SLIP:
         at = 0.5 * (log.times[0] + log.times[-1]) + when * (log.times[-1] - log.times[0])
         raise ValueError(
-            f"the load must be held fast: its centre of mass moves by {1e3 * way:.2g} mm in the gripper at about"
+            f"the load must be held fast: its centre of mass moves by {1e3 * way:.2g} mm in the gripper"
+            f" at about"
             f" {at:.3g} s; take the part of the log before or after it (WristLog.part)"
         )
 
@@ -288,7 +292,8 @@ def _check_units(rows: _Rows, fit: _Fit) -> None:
     ratio = of_torques / max(of_forces, 1e-300)
     if split.noise[1] < _BETTER * fit.noise[1] and not 1 / _UNLIKE < ratio < _UNLIKE:
         raise ValueError(
-            f"torques must be in N m, about the sensor's origin: they speak of a centre of mass {ratio:.3g} times as"
+            f"torques must be in N m, about the sensor's origin: they speak of a centre of mass"
+            f" {ratio:.3g} times as"
             " far away as forces do; divide N mm by 1000"
         )
 
@@ -307,7 +312,8 @@ def _load(rows: _Rows, fit: _Fit, messages: list[str]) -> Load:
     unobserved = tuple(name for name in _NAMES if lost[name])
     if unobserved:
         messages.append(
-            f"not observed: {', '.join(unobserved)}; turn the sensor about two axes for mass and centre, and shake"
+            f"not observed: {', '.join(unobserved)}; turn the sensor about two axes for mass and centre,"
+            f" and shake"
             " the load about three for its inertia"
         )
     found = {"mass": np.asarray(mass), "centre": centre, "inertia": inertia}
@@ -360,7 +366,9 @@ def _of_a_body(fit: _Fit, messages: list[str]) -> np.ndarray:
     factor = np.linalg.cholesky(near)
     start = np.concatenate([np.log(np.diagonal(factor)), factor[np.tril_indices(4, -1)], fit.theta[10:]])
     best = least_squares(off, start, x_scale="jac").x
-    messages.append("the least squares are those of no body: the likeliest inertia that a body can have is given")
+    messages.append(
+        "the least squares are those of no body: the likeliest inertia that a body can have is given"
+    )
     return np.concatenate([_of_factor(best[:10]), best[10:]])
 
 

@@ -152,7 +152,9 @@ def twists(log: WristLog) -> Twists:
     """
     step = float(np.median(np.diff(log.times)))
     half = int(np.clip(round(_SMOOTHED / step), _DEGREE, 25))
-    whole = np.isfinite(np.column_stack([log.position, log.orientation, log.force, log.torque])).all(axis=1)
+    whole: np.ndarray = np.isfinite(
+        np.column_stack([log.position, log.orientation, log.force, log.torque])
+    ).all(axis=1)
     middle = np.arange(half, len(log.times) - half)
     near = middle[:, None] + np.arange(-half, half + 1)
     # A gap in time is no motion to fit a polynomial to.
@@ -161,7 +163,8 @@ def twists(log: WristLog) -> Twists:
     middle, near = middle[good], near[good]
     if len(middle) < _LEAST:
         raise ValueError(
-            f"the log must have {_LEAST} rows with poses, forces and torques, each with {half} such rows before"
+            f"the log must have {_LEAST} rows with poses, forces and torques, each with {half} such rows"
+            f" before"
             f" and after it, got {len(middle)}"
         )
     tau = (log.times[near] - log.times[middle][:, None]) / (half * step)
@@ -192,8 +195,8 @@ def load_wrist_log(path: str | os.PathLike[str], *, frame: str = "sensor", **opt
     """Read a log of a wrist's sensor from a table (.csv, .txt).
 
     Columns: what `load_motion` reads of the sensor's pose (`time`, `x, y, z`, `qw, qx, qy, qz`, or as ROS has
-    them), forces `fx, fy, fz` [N] and torques `mx, my, mz` [N m] (also `force.x`, `torque.x`, `wrench.force.x`,
-    `tau_x`; `tx, ty, tz` beside `x, y, z`). Units may stand in names, `mx [N mm]`.
+    them), forces `fx, fy, fz` [N] and torques `mx, my, mz` [N m] (also `force.x`, `torque.x`,
+    `wrench.force.x`, `tau_x`; `tx, ty, tz` beside `x, y, z`). Units may stand in names, `mx [N mm]`.
 
     Args:
         path: The file.
@@ -219,7 +222,9 @@ def load_wrist_log(path: str | os.PathLike[str], *, frame: str = "sensor", **opt
         if any(column is None for column in columns):
             letters = "f" if key == "force" else "m"
             missing = [f"{letters}{side}" for side, k in _SIDES.items() if columns[k] is None]
-            raise ValueError(f"{source} must have columns of the {key}, {missing} are missing of {list(table.header)}")
+            raise ValueError(
+                f"{source} must have columns of the {key}, {missing} are missing of {list(table.header)}"
+            )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         motion = load_motion(source, names="sensor", **options)

@@ -18,7 +18,7 @@ from dano.robots.formats._lacking import EQUALITIES
 _LAWS = ("stiffness", "damping", "frictionloss", "armature")
 _FLAGS = dict(stiffness="SPRING", damping="DAMPER", frictionloss="FRICTIONLOSS", limited="LIMIT")
 _STRAIGHT = 1e-12
-"""Share of the largest coefficient of a length, or of a range, below which a joint has no part in it."""
+"""Share of its largest coefficient below which a joint does not count, and of a range without width."""
 
 
 class Length(NamedTuple):
