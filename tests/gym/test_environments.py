@@ -237,6 +237,8 @@ def test_environments_have_an_id(tmp_path):
 def test_actions_that_are_no_numbers_are_refused(pushed):
     env = make_env(*pushed)
     env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action must have shape \(3,\), got \(5,\)"):
+        env.step(np.zeros(5))
     with pytest.raises(ValueError, match="action must be finite, got"):
         env.step(np.full(env.action_space.shape, np.nan))
 

@@ -73,7 +73,7 @@ class SceneEnv(gymnasium.Env):
 
     def step(self, action):
         """See `gymnasium.Env.step`."""
-        action = _finite(action)
+        action = _finite(action, self.action_space.shape)
         before, self._step = self.state, self._step + 1
         found = self._roomy(before, action, self._step - 1)
         self.state, *numbers = found
@@ -137,7 +137,7 @@ class SceneVectorEnv(gymnasium.vector.VectorEnv):
 
     def step(self, actions):
         """See `gymnasium.vector.VectorEnv.step`."""
-        actions = _finite(actions)
+        actions = _finite(actions, self.action_space.shape)
         begins = self._ended
         self._begin(begins)
         self._steps = np.where(begins, 0, self._steps)
@@ -223,13 +223,15 @@ def _spaces(rules: Rules) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     return observation, gymnasium.spaces.Box(-1.0, 1.0, (acted,), np.float32)
 
 
-def _finite(action: Any) -> np.ndarray:
+def _finite(action: Any, shape: tuple[int, ...] | None) -> np.ndarray:
     """An action as an array.
 
     Raises:
-        ValueError: If a number is not finite.
+        ValueError: If its shape is another, or a number is not finite.
     """
     numbers = np.asarray(action)
+    if numbers.shape != shape:
+        raise ValueError(f"action must have shape {shape}, got {numbers.shape}")
     if not np.all(np.isfinite(numbers)):
         raise ValueError(f"action must be finite, got {shown(numbers.tolist())}")
     return numbers
