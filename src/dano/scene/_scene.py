@@ -43,7 +43,7 @@ from dano.scene._making import (
     warn_of_long_steps,
 )
 from dano.scene._motors import Motor
-from dano.scene._others import Others, others_of, unnamed_contacts
+from dano.scene._others import OnPlanes, Others, others_of, unnamed_contacts
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 Parts = TypeVar("Parts", tuple[Joint, ...], tuple[Loop, ...])
@@ -318,7 +318,14 @@ class Scene(eqx.Module):
                 raise ValueError(f"material must be changed in {list(self.others.law.reads)}, got {key!r}")
         params = self.others.params
         values = [getattr(params, k).at[i].set(checked_parameter(k, value)) for k, value in changes.items()]
-        return eqx.tree_at(lambda s: [getattr(s.others.params, key) for key in changes], self, values)
+        scene = eqx.tree_at(lambda s: [getattr(s.others.params, key) for key in changes], self, values)
+        of_planes = {
+            key: value for key, value in zip(changes, values, strict=True) if key in OnPlanes._fields
+        }
+        on_planes = self.others.on_planes
+        for key, value in of_planes.items():
+            on_planes = on_planes._replace(**{key: getattr(on_planes, key).at[i].set(value[i])})
+        return eqx.tree_at(lambda s: s.others.on_planes, scene, on_planes)
 
     def replace_body(self, name: str, **changes: Numbers) -> "Scene":
         """The scene with some of a body's `mass, inertia, com, mass_scale, com_offset` changed.
