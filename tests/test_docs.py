@@ -8,9 +8,12 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from mktestdocs import grab_code_blocks
+
+from dano.names import Trouble, TROUBLES
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROGRAMS = {
@@ -21,7 +24,11 @@ PROGRAMS = {
 # Pages whose programs take a minute each to compile; what they show has tests of its own beside it.
 LONG = ("docs/arm.md", "docs/identify.md", "docs/joints.md", "docs/learn.md", "docs/robots.md")
 # Packages that few have.
-NEEDS = {"docs/arm.md": ("pybullet_data",), "docs/worlds.md": ("newton", "pxr")}
+NEEDS = {
+    "docs/arm.md": ("pybullet_data",),
+    "docs/splats.md": ("mujoco_warp",),
+    "docs/worlds.md": ("newton", "pxr"),
+}
 # Of the command line, the commands are what is public.
 PACKAGES = [p for p in sorted((REPOSITORY / "src" / "dano").glob("*/__init__.py")) if p.parent.name != "cli"]
 WIDEST = 90
@@ -99,6 +106,12 @@ def test_the_index_leads_to_every_page():
     # Parts of the benchmarks are listed on their own first page.
     parts = {name for name in linked("benchmarks.md") if name.startswith("benchmarks/")}
     assert linked("index.md") | parts == {str(p.relative_to(docs)) for p in docs.rglob("*.md")} - {"index.md"}
+
+
+def test_messages_name_headings_that_are_there():
+    page = (REPOSITORY / TROUBLES).read_text(encoding="utf-8")
+    headings = {heading.lower().replace(" ", "-") for heading in re.findall(r"^## (.+)$", page, re.MULTILINE)}
+    assert set(get_args(Trouble)) <= headings
 
 
 MENU = (REPOSITORY / "mkdocs.yml").read_text(encoding="utf-8")

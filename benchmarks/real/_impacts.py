@@ -1,10 +1,11 @@
 """1,718 impacts of an ellipse on a floor, one by one: the velocity after each from that before.
 
-An ellipse of 70 by 50 mm falls between two panes (MCube Lab, MIT: planar-impact-dataset). The file brings what
-six laws say, and the Jacobian of the contact that they were computed with. **The row of that Jacobian along the
-floor has the wrong sign**: it takes x and θ for right-handed, but the recorded motion is left-handed. Friction
-then turns the ellipse the wrong way in all six, and a third of the measured spin seems to need moments that no
-point contact has. `_jacobian` shows it from the recordings alone; dano's scene has its joint turn z into x.
+An ellipse of 70 by 50 mm falls between two panes (MCube Lab, MIT: planar-impact-dataset). The file brings
+what six laws say, and the Jacobian of the contact that they were computed with. **The row of that Jacobian
+along the floor has the wrong sign**: it takes x and θ for right-handed, but the recorded motion is
+left-handed. Friction then turns the ellipse the wrong way in all six, and a third of the measured spin seems
+to need moments that no point contact has. `_jacobian` shows it from the recordings alone; dano's scene has
+its joint turn z into x.
 """
 
 import warnings
@@ -187,7 +188,9 @@ def _others(fitted: Impacts, held: Impacts) -> list[Row]:
     found += _tuned(group, "two constants, Jacobian of the file", newton, fitted, held, arm, of_held)
     arm, of_held = (arms(x.before[:, 2], SEMI_AXES) for x in (fitted, held))
     found += _tuned(group, "two constants, sign put right, Newton", newton, fitted, held, arm, of_held)
-    return found + _tuned(group, "two constants, sign put right, Poisson", poisson, fitted, held, arm, of_held)
+    return found + _tuned(
+        group, "two constants, sign put right, Poisson", poisson, fitted, held, arm, of_held
+    )
 
 
 def _tuned(
@@ -246,8 +249,12 @@ def _jacobian(held: Impacts) -> list[Row]:
     slip = np.abs(held.after[:, 3] - below * held.after[:, 5])
     other = np.abs(held.after[:, 3] + below * held.after[:, 5])
     return [
-        Row(group, "share of the normal impulse's moment in the spin", normal, "", note="1 where all is right"),
-        Row(group, "share of friction's moment in the spin", tangent, "", note="−1 were the file's sign right"),
+        Row(
+            group, "share of the normal impulse's moment in the spin", normal, "", note="1 where all is right"
+        ),
+        Row(
+            group, "share of friction's moment in the spin", tangent, "", note="−1 were the file's sign right"
+        ),
         Row(group, "slip after, median", float(np.median(slip)), "m/s"),
         Row(group, "slip after, by the file's Jacobian", float(np.median(other)), "m/s"),
         Row(
@@ -271,6 +278,8 @@ def picture(source: Source, folder: Path) -> Path:
     seen = held.after[:, 3:]
     panels = [
         (f"{words} after [{unit}]", seen[:, k], held.published[:, 4, k], after[:, k])
-        for k, (words, unit) in enumerate((("speed along the floor", "m/s"), ("rise", "m/s"), ("spin", "rad/s")))
+        for k, (words, unit) in enumerate(
+            (("speed along the floor", "m/s"), ("rise", "m/s"), ("spin", "rad/s"))
+        )
     ]
     return scatter(folder / "real_impacts.png", panels, ("Wang and Mason, of the file", "dano"))

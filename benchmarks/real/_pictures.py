@@ -21,7 +21,8 @@ def scatter(
         axis.plot(edges, edges, color=SEEN, lw=0.8)
         for values, colour, label in ((other, OTHER, names[0]), (ours, OURS, names[1])):
             axis.plot(seen, values, ".", ms=2, color=colour, label=label, alpha=0.6)
-        axis.set(title=title, xlabel="recorded", xlim=edges)
+        axis.set_title(title, fontsize=8)
+        axis.set(xlabel="recorded", xlim=edges)
         margin = 0.6 * (edges[1] - edges[0])
         axis.set_ylim(edges[0] - margin, edges[1] + margin)
     axes[0].set_ylabel("predicted")
@@ -58,7 +59,11 @@ def squares(
     corners = half * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
     for axis, i in zip(axes, np.linspace(0, len(seen) - 1, 6, dtype=int)[1:5], strict=True):
         axis.plot(*(1e3 * seen[i, :, :2]).T, color=SEEN, lw=0.8)
-        ends = ((seen[i, frames[-1]], SEEN, "recorded"), (other[i, -1], OTHER, "MuJoCo"), (ours[i, -1], OURS, "dano"))
+        ends = (
+            (seen[i, frames[-1]], SEEN, "recorded"),
+            (other[i, -1], OTHER, "MuJoCo"),
+            (ours[i, -1], OURS, "dano"),
+        )
         for (x, z, angle), colour, label in ends:
             turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
             axis.plot(*(1e3 * (corners @ turn + [x, z])).T, color=colour, lw=1.2, label=label)
@@ -82,7 +87,9 @@ def paths(
     figure, axes = figure_of(n, width=2.4, height=1.8)
     corners = half * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
     for axis, name, *three in zip(axes, names, seen, ours, other, strict=False):
-        for poses, colour, label in zip(three, (SEEN, OURS, OTHER), ("recorded", "dano", "limit surface"), strict=True):
+        for poses, colour, label in zip(
+            three, (SEEN, OURS, OTHER), ("recorded", "dano", "limit surface"), strict=True
+        ):
             axis.plot(*(1e3 * poses[:, :2]).T, color=colour, lw=0.9, label=label)
             x, y, angle = poses[-1]
             turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
@@ -91,4 +98,25 @@ def paths(
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_xlabel("mm")
     axes[0].legend(fontsize=6, loc="best", frameon=False)
+    return saved(figure, path)
+
+
+def tools(path: Path, panels: Sequence[tuple[str, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]) -> Path:
+    """Outlines of tools, with their centres of mass: true, of their parts, of one material."""
+    figure, axes = figure_of(len(panels), width=2.2, height=2.2)
+    for axis, (name, points, true, parts, one) in zip(axes, panels, strict=True):
+        # The two directions in which it is longest.
+        first, second = np.argsort(-np.ptp(points, axis=0))[:2]
+        axis.plot(1e3 * points[:, second], 1e3 * points[:, first], ".", ms=1, color="#bbbbbb")
+        marks = (
+            (one, OTHER, "x", "one material"),
+            (parts, OURS, "o", "dano: parts"),
+            (true, SEEN, "+", "true"),
+        )
+        for centre, colour, mark, label in marks:
+            axis.plot(1e3 * centre[second], 1e3 * centre[first], mark, color=colour, ms=7, label=label)
+        axis.set_title(name, fontsize=7)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_xlabel("mm")
+    axes[0].legend(fontsize=6, frameon=False)
     return saved(figure, path)

@@ -75,7 +75,7 @@ _PARTS = 400
 
 
 def moment_left(before: np.ndarray, after: np.ndarray, arm, gyration: float) -> np.ndarray:
-    """What a force at the point does not explain of the change of spin, over the impulse along the normal [m].
+    """What a force at the point leaves of the change of spin, over the impulse along the normal [m].
 
     It is how far from the point the impulse must have passed.
     """

@@ -1,21 +1,20 @@
-"""Pushes: a robot's round pusher moves a block over a table; where the block goes, from the pusher's path alone.
+"""Pushes: a robot's round pusher moves a block over a table; where it goes, from the pusher's path alone.
 
-Recorded by the MCube Lab, MIT (cpush): a square block of 90 mm and 1.05 kg on plywood or on black plastic, some
-pushes with blows from outside, which no simulator is told of. So ends are compared twice: of whole recordings,
-and of stretches of 2 s, each from where the block was.
+Recorded by the MCube Lab, MIT (cpush): a square block of 90 mm and 1.05 kg on plywood or on black plastic,
+some pushes with blows from outside, which no simulator is told of. So ends are compared twice: of whole
+recordings, and of stretches of 2 s, each from where the block was.
 
 Beside dano stands what people use: the quasi-static limit surface (Goyal, Ruina and Papadopoulos 1991; Lynch,
 Maekawa and Tanie 1992), an ellipsoid in force and moment, with a pusher that sticks or slips.
 
-What belongs to the measurement is fitted once, for both: the pusher's radius, and the scale and the zero of its
-coordinates beside those of the camera (they differ by half a per cent).
+What belongs to the measurement is fitted once, for both: the pusher's radius, and the scale and the zero of
+its coordinates beside those of the camera (they differ by half a per cent).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,13 +61,16 @@ class Push:
         Raises:
             ValueError: If the file has other members, or its times do not increase.
         """
-        found = {key: value.astype(float) for key, value in members(path, ("time", "slider", "pusher")).items()}
+        found = {
+            key: value.astype(float) for key, value in members(path, ("time", "slider", "pusher")).items()
+        }
         times = found["time"] - found["time"][0]
         if np.any(np.diff(times) <= 0):
             raise ValueError(f"{path}: time must increase")
         even = np.arange(0.0, times[-1], FRAME)
         block, pusher = (
-            np.column_stack([np.interp(even, times, column) for column in found[key].T]) for key in ("slider", "pusher")
+            np.column_stack([np.interp(even, times, column) for column in found[key].T])
+            for key in ("slider", "pusher")
         )
         return cls(path.stem.removeprefix("push_"), block, pusher)
 
@@ -83,9 +85,7 @@ class Push:
     def stretches(self) -> "list[Push]":
         """Its stretches of two seconds."""
         firsts = range(0, len(self) - STRETCH + 1, STRETCH)
-        return [
-            Push(self.name, self.block[k : k + STRETCH], self.pusher[k : k + STRETCH]) for k in firsts
-        ]
+        return [Push(self.name, self.block[k : k + STRETCH], self.pusher[k : k + STRETCH]) for k in firsts]
 
 
 def halves(source: Source) -> tuple[list[Push], list[Push]]:
@@ -123,11 +123,20 @@ def rows(source: Source | None, *, quick: bool = False) -> list[Row]:
                 low, middle, high = np.quantile(values[:, k], (0.25, 0.5, 0.75))
                 note = f"{len(values)} of {len(held)} recordings; {words[name]}; {source.words}"
                 found.append(
-                    Row(group, f"{label}: {what} at the end, median error", middle, unit, quartiles=(low, high), note=note)
+                    Row(
+                        group,
+                        f"{label}: {what} at the end, median error",
+                        middle,
+                        unit,
+                        quartiles=(low, high),
+                        note=note,
+                    )
                 )
     for k, label in enumerate(("whole recordings", "stretches of 2 s")):
         ratio = 100 * float(medians["dano"][k] / medians["limit surface"][k])
-        found.append(Row("Pushes: dano over limit surface", f"{label}: position at the end", ratio, "%", 100.0))
+        found.append(
+            Row("Pushes: dano over limit surface", f"{label}: position at the end", ratio, "%", 100.0)
+        )
     for key, value in measuring.items():
         unit = "" if key == "scale" else "mm"
         found.append(Row("Pushes: the measurement", key, value if key == "scale" else 1e3 * value, unit))
@@ -151,8 +160,9 @@ def _misfit(off: np.ndarray) -> float:
 def quasi_static(push: Push, measuring: Mapping[str, float], surface: Mapping[str, float]) -> np.ndarray:
     """Poses of the block by an ellipsoidal limit surface.
 
-    With f the force and p the point, in the block's frame, the block moves by f and turns by (p × f)/c², times
-    one number. The pusher sticks if that needs no more friction than there is, else the force is on the cone.
+    With f the force and p the point, in the block's frame, the block moves by f and turns by (p × f)/c²,
+    times one number. The pusher sticks if that needs no more friction than there is, else the force is on
+    the cone.
     """
     path, pose = push.path(measuring), push.block[0].copy()
     found = [pose]
@@ -176,7 +186,7 @@ def quasi_static(push: Push, measuring: Mapping[str, float], surface: Mapping[st
 
 
 def _touch(centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Point, inward normal and depth of a round pusher in a square, in the frame of the square; None: apart."""
+    """Point, inward normal and depth of a round pusher in a square, in its frame; None: apart."""
     near = np.clip(centre, -HALF, HALF)
     away = centre - near
     apart = float(np.hypot(*away))
@@ -229,7 +239,10 @@ def scene(radius: float, friction: float, feet: float, table: float = 0.3) -> da
     block = dano.Body("block", dano.Box((HALF, HALF, HEIGHT)), mass=MASS)
     names = [f"foot{k}" for k in range(4)]
     bodies = [block, *(dano.Body(name, dano.Sphere(FOOT), mass=1e-4) for name in names)]
-    bodies += [dano.Body("rail", dano.Sphere(0.01), mass=CARRIAGE), dano.Body("table", dano.HalfSpace(), fixed=True)]
+    bodies += [
+        dano.Body("rail", dano.Sphere(0.01), mass=CARRIAGE),
+        dano.Body("table", dano.HalfSpace(), fixed=True),
+    ]
     bodies.append(dano.Body("pusher", dano.Cylinder(radius, HEIGHT), mass=CARRIAGE))
     joints = [
         dano.Joint("block", name, "weld", position=(x, y, -HEIGHT))
@@ -238,11 +251,11 @@ def scene(radius: float, friction: float, feet: float, table: float = 0.3) -> da
     motor = dano.Motor("position", stiffness=MOTOR)
     joints += [
         dano.Joint(None, "rail", "slide", axis=(1, 0, 0), position=(0, 0, 0.2), motor=motor),
-        dano.Joint("rail", "pusher", "slide", axis=(0, 1, 0), position=(0, 0, FOOT + HEIGHT - 0.2), motor=motor),
+        dano.Joint(
+            "rail", "pusher", "slide", axis=(0, 1, 0), position=(0, 0, FOOT + HEIGHT - 0.2), motor=motor
+        ),
     ]
-    contacts = [
-        dano.Contact(name, "table", dano.ContactParams(sliding_friction=table)) for name in names
-    ]
+    contacts = [dano.Contact(name, "table", dano.ContactParams(sliding_friction=table)) for name in names]
     contacts.append(dano.Contact("pusher", "block", dano.ContactParams(sliding_friction=friction)))
     return dano.Scene.create(bodies, contacts, joints=joints, timestep=FRAME)
 
@@ -263,7 +276,10 @@ def simulated(
     controls = driven(made, np.stack(commands))
     runs = dano.rollouts(made, state, longest - 1, controls=controls)
     index = made.index("block")
-    position, turn = np.asarray(runs.states.position)[:, :, index], np.asarray(runs.states.orientation)[:, :, index]
+    position, turn = (
+        np.asarray(runs.states.position)[:, :, index],
+        np.asarray(runs.states.orientation)[:, :, index],
+    )
     angle = np.unwrap(2 * np.arctan2(turn[..., 3], turn[..., 0]), axis=1)
     poses = np.concatenate([position[..., :2], angle[..., None]], axis=-1)
     # Whole turns of a quaternion's angle are no turns of the block.
@@ -318,7 +334,13 @@ def _frictions(pushes: Sequence[Push], measuring, values, quick: bool) -> list[R
         for name in ("pusher", "table"):
             low, high = fit.interval(name)
             found.append(
-                Row(group, f"{name}, {push.name}", float(fit.values[name]), "", note=f"95 % {low:.3f} to {high:.3f}")
+                Row(
+                    group,
+                    f"{name}, {push.name}",
+                    float(fit.values[name]),
+                    "",
+                    note=f"95 % {low:.3f} to {high:.3f}",
+                )
             )
     if len(fits) < 2:
         return found
@@ -329,7 +351,15 @@ def _frictions(pushes: Sequence[Push], measuring, values, quick: bool) -> list[R
         inside = sum(fit.interval(name)[0] <= middle <= fit.interval(name)[1] for fit in fits)
         note = f"scatter between recordings {np.std(each, ddof=1):.3f}, stated {np.median(errors):.3f}"
         found.append(
-            Row(group, f"{name}: intervals that hold the median", 100 * inside / len(fits), "%", 90.0, True, note=note)
+            Row(
+                group,
+                f"{name}: intervals that hold the median",
+                100 * inside / len(fits),
+                "%",
+                90.0,
+                True,
+                note=note,
+            )
         )
     return found
 

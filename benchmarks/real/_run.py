@@ -5,10 +5,10 @@ import functools
 from pathlib import Path
 
 from benchmarks._measure import load_average, parse_arguments, parts_option, report, rows_of_parts
-from benchmarks.real import _impacts, _pushes, _squares
+from benchmarks.real import _impacts, _pushes, _squares, _tools
 from benchmarks.real._data import data_folder, Source
 
-PARTS = {"impacts": _impacts, "squares": _squares, "pushes": _pushes}
+PARTS = {"impacts": _impacts, "squares": _squares, "pushes": _pushes, "tools": _tools}
 
 
 def run() -> None:

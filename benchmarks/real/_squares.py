@@ -32,7 +32,8 @@ STEPS_A_FRAME = 2
 # about constants and would drown the others.
 _HALF_OFF = (0.03, 0.5)
 
-# A square falls freely while no corner is nearer to the floor than this [m]; and frames of it that are enough.
+# A square falls freely while no corner is nearer to the floor than this [m]; and frames of it that are
+# enough.
 _CLEAR, _ENOUGH = 0.006, 5
 
 Simulator = Callable[[np.ndarray, Mapping[str, float]], np.ndarray]
@@ -56,7 +57,7 @@ class Drops:
 
 @dataclass(frozen=True)
 class Floor:
-    """Where the floor is in the camera's axes, and what θ is of a square that lies: from where squares lie."""
+    """Where the floor is in the camera's axes, and what θ is of a square that lies."""
 
     height: float
     slope: float
@@ -210,7 +211,8 @@ def of_mujoco(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
         f'<default><geom condim="3" friction="{values["friction"]} 0 0" '
         f'solref="{-values["stiffness"]} {-values["damping"]}"/></default>'
         '<worldbody><geom type="plane" size="5 5 1"/><body>'
-        '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint type="hinge" axis="0 -1 0"/>'
+        '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint type="hinge" axis="0'
+        ' -1 0"/>'
         f'<inertial mass="{MASS}" pos="0 0 0" diaginertia="{inertia} {inertia} {inertia}"/>'
         f'<geom type="box" size="{HALF} {HALF} {HALF}"/>'
         "</body></worldbody></mujoco>"
@@ -258,14 +260,16 @@ def _rows(group: str, off: np.ndarray, note: str) -> list[Row]:
 
 
 def _stays(held: Drops) -> np.ndarray:
-    """What one would say without a simulator: it lies where it was after .1 s, on the face that was lowest."""
+    """What one would say without a simulator: it lies where it was after .1 s, on its lowest face."""
     early = held.poses[:, 25]
-    flat = np.stack([early[:, 0], np.full(len(early), HALF), np.round(early[:, 2] * 2 / np.pi) * np.pi / 2], -1)
+    flat = np.stack(
+        [early[:, 0], np.full(len(early), HALF), np.round(early[:, 2] * 2 / np.pi) * np.pi / 2], -1
+    )
     return np.repeat(flat[:, None], len(MOMENTS), axis=1)
 
 
 def _beside(off: Mapping[str, np.ndarray]) -> list[Row]:
-    """dano's medians over MuJoCo's, and how sure that is."""
+    """Dano's medians over MuJoCo's, and how sure that is."""
     found = []
     for k, moment in enumerate(MOMENTS):
         for column, words in enumerate(("position", "angle")):
@@ -313,4 +317,6 @@ def picture(source: Source, folder: Path) -> Path:
     for name, (simulate, start, steps) in SIMULATORS.items():
         values, _ = tuned(simulate, fitted, start, steps, tries=20)
         found[name] = simulate(held.starts, values)
-    return squares(folder / "real_squares.png", held.poses, found["dano"], found["MuJoCo"], HALF, list(MOMENTS.values()))
+    return squares(
+        folder / "real_squares.png", held.poses, found["dano"], found["MuJoCo"], HALF, list(MOMENTS.values())
+    )

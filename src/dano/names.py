@@ -1,4 +1,4 @@
-"""Names that were meant, in messages about names that are unknown; names that have moved."""
+"""Names in messages: those that were meant, those that have moved, and the page that helps."""
 
 import difflib
 import importlib
@@ -6,7 +6,18 @@ import sys
 import warnings
 from collections.abc import Iterable
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
+
+TROUBLES = "docs/troubles.md"
+"""The page of the documentation that says what helps."""
+Trouble = Literal[
+    "the-first-start-is-slow",
+    "steps-did-not-converge",
+    "a-body-falls-through",
+    "a-body-begins-inside-another",
+    "nothing-touches",
+]
+"""Its headings that messages name."""
 
 _ELSEWHERE = {
     "bodies": ("body", "object", "objects", "link", "geom"),
@@ -34,6 +45,11 @@ _ELSEWHERE = {
     "fixed": ("static", "kinematic"),
 }
 """What other programs call things that have names here."""
+
+
+def see(trouble: Trouble) -> str:
+    """What to append to a message about something that the page of troubles explains."""
+    return f"see {TROUBLES}#{trouble}"
 
 
 def did_you_mean(name: object, valid: Iterable[str]) -> str:

@@ -60,12 +60,6 @@ class Train:
     json: Path | None = None
     previews: Path | None = None
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _learn
-
-        _learn.train(self)
-
 
 @dataclass(frozen=True)
 class Poses:
@@ -127,12 +121,6 @@ class Poses:
     seed: int = 0
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _learn
-
-        _learn.poses(self)
-
 
 @dataclass(frozen=True)
 class Data:
@@ -156,12 +144,6 @@ class Data:
     table: float | None = None
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _learn
-
-        _learn.data(self)
-
 
 @dataclass(frozen=True)
 class Build:
@@ -183,23 +165,19 @@ class Build:
     options: Annotated[BuildOptions, arg(name="")] = BuildOptions()
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _objects
-
-        _objects.build(self)
-
 
 @dataclass(frozen=True)
 class Import:
     """Read a field of another program and write it as a grid that dano reads.
+
+    With `--to`, Gaussian splats become an object in a folder that MuJoCo or Newton loads, splats included.
 
     Attributes:
         file: nerfstudio checkpoint (.ckpt), instant-ngp snapshot (.ingp, .msgpack), Gaussian splats (.ply),
             OpenVDB or NanoVDB grid (.vdb, .nvdb), PyTorch module (.pt2, .pt, .pth), voxels (.npy, .npz),
             model of dano (.npz), mesh (.obj, .stl, .ply, .off, .glb, .gltf, .3mf, .dae, .step), a shipped one
             (bunny, soap, trained_bunny, trained_soap), or a function as package.module:name.
-        output: Where to write the grid (.npz).
+        output: Where to write the grid (.npz), or with --to the folder.
         crop: Box to keep: lowest x y z, highest x y z, in the file's frame and units.
         scale: Length of a unit of the file [m]; default: as meshes say or their size tells, else 1.
         units: The same by name.
@@ -210,6 +188,11 @@ class Import:
             as their walls need.
         interpolation: How the grid is interpolated between its nodes; default: as the format has it.
         skip_nan: Gaussian splats: leave out those with numbers that are not finite; how many is said.
+        box: Gaussian splats: take one object out of a scene, the Gaussians whose centre lies in this box:
+            lowest x y z, highest x y z, in the file's frame and units.
+        sphere: The same for a sphere: centre x y z, radius.
+        to: Gaussian splats: write a folder as `dano export` does, with the Gaussians for cameras: mjcf, usd.
+        mass: With --to: mass of the object [kg]; default: as dense as water.
         hollow: Gaussian splats: do not fill the inside. Splats lie on surfaces, so their inside is empty.
         spacing: Voxels (.npy): distance between voxels in the file's units; default: longest side 1.
         origin: Voxels (.npy): centre of the first voxel.
@@ -233,6 +216,10 @@ class Import:
     resolution: int | None = None
     interpolation: Literal["linear", "quadratic", "cubic"] | None = None
     skip_nan: bool = False
+    box: tuple[float, float, float, float, float, float] | None = None
+    sphere: tuple[float, float, float, float] | None = None
+    to: tuple[Literal["mjcf", "urdf", "usd", "obj"], ...] = ()
+    mass: float | None = None
     hollow: bool = False
     spacing: float | None = None
     origin: tuple[float, float, float] | None = None
@@ -242,12 +229,6 @@ class Import:
     module: str | None = None
     keep_transform: bool = False
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _import
-
-        _import.import_field(self)
 
 
 @dataclass(frozen=True)
@@ -266,12 +247,6 @@ class Inspect:
     png: Path | None = None
     no_png: bool = False
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _objects
-
-        _objects.inspect(self)
 
 
 @dataclass(frozen=True)
@@ -310,12 +285,6 @@ class Simulate:
     resume: bool = False
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _scenes
-
-        _scenes.simulate(self)
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -343,12 +312,6 @@ class Plan:
     slow_motion: float = 1.0
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import planning
-
-        planning.plan(self)
-
 
 @dataclass(frozen=True)
 class View:
@@ -368,12 +331,6 @@ class View:
     beside: Path | None = None
     page: Path | None = None
     port: int = 8080
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _scenes
-
-        _scenes.view(self)
 
 
 @dataclass(frozen=True)
@@ -411,12 +368,6 @@ class Export:
     texture_size: int = 1024
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _export
-
-        _export.export(self)
-
 
 @dataclass(frozen=True)
 class Compare:
@@ -448,12 +399,6 @@ class Compare:
     seed: int = 0
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _compare
-
-        _compare.compare(self)
-
 
 @dataclass(frozen=True)
 class Cache:
@@ -474,12 +419,6 @@ class Cache:
     limit: str | None = None
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _cache
-
-        _cache.cache(self)
-
 
 @dataclass(frozen=True)
 class Demo:
@@ -497,9 +436,3 @@ class Demo:
     output: Output = Path("dano-demo")
     draft: bool = False
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _scenes
-
-        _scenes.demo(self)

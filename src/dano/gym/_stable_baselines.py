@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 from dano.gym._environments import SceneVectorEnv
 
@@ -24,7 +24,8 @@ class StableBaselinesEnv(VecEnv):
         seen, _ = self.env.reset(seed=self._seeds[0], options=options)
         self._reset_seeds()
         self._reset_options()
-        return seen
+        # PyTorch wants arrays that it may write to.
+        return np.array(seen)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for `step_wait`."""
@@ -48,7 +49,7 @@ class StableBaselinesEnv(VecEnv):
             for i in np.flatnonzero(done):
                 infos[i]["terminal_observation"] = seen[i].copy()
             seen = np.where(done[:, None], self.env.begun(done), seen)
-        return seen, np.asarray(rewards, np.float32), done, infos
+        return np.array(seen), np.asarray(rewards, np.float32), done, infos
 
     def close(self) -> None:
         """Close the environment."""

@@ -32,6 +32,7 @@ from dano.identification._uncertainty import uncertainty
 from dano.identification._windows import Plan
 from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
+from dano.names import see
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop
 
@@ -239,7 +240,10 @@ def _identification(
     fit_errors = _errors(plan, motions, at_best)
     messages = list(sure.messages)
     if failed := int(np.sum(np.asarray(at_best.unconverged))):
-        messages.append(f"{failed} steps did not converge at the values found; try a smaller timestep")
+        page = see("steps-did-not-converge")
+        messages.append(
+            f"{failed} steps did not converge at the values found; try a smaller timestep; {page}"
+        )
     worth = None
     if best.stop is Stop.STUCK or problem.smoothing is not None:
         worth = worth_of(problem, best)

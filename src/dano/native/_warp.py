@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dano.caches import cache_folder
+from dano.names import see
 
 _WORTH_A_WORD = 2.0
 """Seconds after which compiling is said."""
@@ -151,7 +152,10 @@ def _without_stderr() -> Iterator[None]:
 @contextlib.contextmanager
 def _said(words: str) -> Iterator[None]:
     """Say in a terminal what takes long."""
-    timer = threading.Timer(_WORTH_A_WORD, lambda: print(f"dano: {words}", file=sys.stderr, flush=True))
+    timer = threading.Timer(
+        _WORTH_A_WORD,
+        lambda: print(f"dano: {words} ({see('the-first-start-is-slow')})", file=sys.stderr, flush=True),
+    )
     timer.daemon = True
     if sys.stderr is not None and sys.stderr.isatty():
         timer.start()

@@ -8,6 +8,7 @@ import numpy as np
 
 from dano.contact import AbstractContactLaw, CentroidLaw, CHUNK, ContactParams, DistributedLaw
 from dano.engine import contact_patches, runs_on
+from dano.names import see
 from dano.progress import Progress
 from dano.scene import Body, Scene, State
 from dano.scene_file._forecast import bounds, fast_spin, Finding, forecast, starts, too_fast
@@ -128,6 +129,7 @@ def check_scene(
     findings += [*starts(scene, patches), *forecast(scene, state, limits), *_fast_spins(scene, states)]
     if cost.unsolved:
         text = f"{cost.unsolved} of the first {cost.steps} steps did not converge; try a smaller timestep"
+        text = f"{text}; {see('steps-did-not-converge')}"
         findings.append(Finding("solver", text))
     bodies = [
         BodyLine(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.contact import CentroidLaw, DistributedLaw, Patch
+from dano.names import see
 from dano.scene import Body, box_volume, Contact, RESOLVED, Scene, State
 
 _STEPS_AN_IMPACT = 20
@@ -123,10 +124,12 @@ def support(scene: Scene, limits: list[Bound]) -> list[Finding]:
     for i in scene.layout.free:
         name = scene.names[i]
         if name not in touched:
-            found.append(Finding("support", f"{name!r} touches nothing: no contact names it"))
+            found.append(
+                Finding("support", f"{name!r} touches nothing: no contact names it; {see('nothing-touches')}")
+            )
         elif limits[i].falls:
             text = f"nothing fixed that {name!r} may touch is below it: it may fall without end"
-            found.append(Finding("support", text))
+            found.append(Finding("support", f"{text}; {see('a-body-falls-through')}"))
     return found
 
 
@@ -298,5 +301,7 @@ def starts(scene: Scene, patches: Sequence[Patch]) -> list[Finding]:
         share = float(patch.overlap[0]) / whole
         if share > _INSIDE:
             text = f"{a!r} and {b!r} start inside each other, by {100 * share:.2g} % of the smaller one"
-            found.append(Finding("start", f"{text}: they will be pushed apart"))
+            found.append(
+                Finding("start", f"{text}: they will be pushed apart; {see('a-body-begins-inside-another')}")
+            )
     return found

@@ -1,6 +1,7 @@
 """One object of several parts, each of a material or a mass of its own."""
 
 import dataclasses
+import itertools
 import os
 import re
 import warnings
@@ -9,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -33,6 +33,16 @@ _PROBES = 20_000
 _NODES, _MARGIN = (96, 256), 3
 """Least and most nodes along the longest side of several parts, and those around them."""
 
+_STEEL, _PLASTIC = 7850.0, 1100.0
+"""Densities [kg/m³] of what tools are made of, for what a doubt says."""
+
+_NOTABLE, _OTHER_COLOUR, _MOST_FACES = 0.01, 30.0, 300_000
+"""Least share of the volume of a part that counts, least difference of a colour of 255, and most faces: a
+second of work."""
+
+_COLOURED = (".ply", ".obj", ".off")
+"""Formats of single meshes whose faces or vertices may have colours."""
+
 _LIKELY = (10.0, 30_000.0)
 """Densities of solids [kg/m³]: from foams to above gold. What is beyond is likely in other units."""
 
@@ -50,8 +60,8 @@ class Part:
     """
 
     source: "str | os.PathLike[str] | AbstractShape"
-    density: float | None = None
-    mass: float | None = None
+    density: int | float | None = None
+    mass: int | float | None = None
 
     def __post_init__(self) -> None:
         """Check it.
@@ -108,7 +118,8 @@ def parts_of(texts: Sequence[str | os.PathLike[str]]) -> list[Part]:
     for text, part in zip(texts, found, strict=True):
         if part is None:
             raise ValueError(
-                f"{text} needs a density [kg/m³] or a mass, as the other parts have: {text}:7850 or {text}:0.3kg"
+                f"{text} needs a density [kg/m³] or a mass, as the other parts have: {text}:7850 or"
+                f" {text}:0.3kg"
             )
     return [part for part in found if part is not None]
 
@@ -137,7 +148,8 @@ def build_parts(
         progress: Called with a description and the share done.
 
     Raises:
-        ValueError: If a part is no solid, or overlaps another by more than a tenth of its volume, or options do
+        ValueError: If a part is no solid, or overlaps another by more than a tenth of its volume, or options
+        do
             not fit.
     """
     parts = checked_items("parts", parts, Part)
@@ -179,8 +191,45 @@ def build_parts(
     return dataclasses.replace(made, mass_model="given", mass_reason=f"sum of {len(parts)} parts: {words}")
 
 
+def materials_doubt(path: Path) -> str | None:
+    """What to say of a mesh that is weighed as one material, but whose closed parts have different colours.
+
+    It says by how much the centre of mass may be off: were the largest part plastic and the rest steel, or
+    the other way round.
+    """
+    if path.suffix.lower() not in _COLOURED or not path.is_file():
+        return None
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, process=True)
+    except Exception:  # each of trimesh's readers raises its own kinds; it was read and mended before
+        return None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) > _MOST_FACES or not mesh.visual.defined:
+        return None
+    pieces = [piece for piece in mesh.split(only_watertight=True) if piece.volume > 0]
+    volumes = np.array([piece.volume for piece in pieces])
+    large = [k for k in range(len(pieces)) if volumes[k] > _NOTABLE * volumes.sum()]
+    colours = np.array([np.asarray(pieces[k].visual.face_colors)[:, :3].mean(axis=0) for k in large])
+    if len(large) < 2 or np.ptp(colours, axis=0).max() < _OTHER_COLOUR:
+        return None
+    volumes = volumes[large]
+    centres = np.array([pieces[k].center_mass for k in large])
+    same = volumes @ centres / volumes.sum()
+    shifts = []
+    for first, rest in ((_PLASTIC, _STEEL), (_STEEL, _PLASTIC)):
+        weights = volumes * np.where(np.arange(len(volumes)) == np.argmax(volumes), first, rest)
+        shifts.append(np.linalg.norm(weights @ centres / weights.sum() - same))
+    share = 100 * max(shifts) / float(np.max(mesh.extents))
+    return (
+        f"{path} has {len(large)} closed parts of different colours, and is weighed as one material: were the"
+        f" largest plastic and the rest steel, or the other way round, the centre of mass would be off by"
+        f" {share:.0f} % of the size; give them as files of their own, FILE:DENSITY each, or their masses"
+    )
+
+
 class _Weight(NamedTuple):
-    """Mass [kg], centre [m, F], inertia about it [kg m²] of a part, and standard errors of their integration."""
+    """Mass [kg], centre [m, F], inertia about it [kg m²] of a part, and errors of their integration."""
 
     mass: float
     com: np.ndarray
@@ -203,7 +252,9 @@ def _shapes(parts: Sequence[Part], options: BuildOptions, tell: Progress) -> lis
                 continue
             found[k], said[k] = _shape(part, {**options.of_file, "units": "mm"})
         first = parts[guessed.index(True)].name
-        said.append([f"all parts are read in millimetres, as {first} must be; units of BuildOptions says otherwise"])
+        said.append(
+            [f"all parts are read in millimetres, as {first} must be; units of BuildOptions says otherwise"]
+        )
     for text in dict.fromkeys(text for texts in said for text in texts):
         warnings.warn(text, UserWarning, stacklevel=3)
     return found
@@ -216,7 +267,7 @@ def _shape(part: Part, options: dict[str, Any]) -> tuple[AbstractShape, list[str
         return part.source, []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        shape = load_field(part.source, **options)
+        shape = load_field(Path(part.source), **options)
     if not isinstance(shape, AbstractShape):
         raise ValueError(
             f"{part.name} must be a mesh to be a part with a density, got {shown(shape)}: it has its own"
@@ -225,7 +276,7 @@ def _shape(part: Part, options: dict[str, Any]) -> tuple[AbstractShape, list[str
 
 
 def _joined(shapes: Sequence[AbstractShape]) -> AbstractShape:
-    """The union as one sampled distance: where parts meet, a spline has a normal, and the lesser of two has none."""
+    """The union as one sampled distance: a spline has normals where parts meet, a minimum has none."""
     if len(shapes) == 1:
         return shapes[0]
     boxes = np.array([np.asarray(shape.bounds, np.float64) for shape in shapes])
@@ -247,10 +298,15 @@ def _joined(shapes: Sequence[AbstractShape]) -> AbstractShape:
 def _weight(part: Part, shape: AbstractShape, options: BuildOptions) -> _Weight:
     moments = shape.solid_moments()
     if moments is None:
-        scale = {"mass": part.mass} if part.density is None else {"mass_scale": part.density}
-        mass = MassProperties.from_field(shape, resolution=options.resolution, key=jax.random.key(0), **scale)
-        errors = (float(mass.mass_error), np.asarray(mass.com_error), np.asarray(mass.inertia_error))
-        return _Weight(float(mass.mass), np.asarray(mass.com), np.asarray(mass.inertia), errors)
+        found = MassProperties.from_field(
+            shape,
+            mass=None if part.mass is None else float(part.mass),
+            mass_scale=1.0 if part.density is None else float(part.density),
+            resolution=options.resolution,
+            key=seed_key(options.seed),
+        )
+        errors = (float(found.mass_error), np.asarray(found.com_error), np.asarray(found.inertia_error))
+        return _Weight(float(found.mass), np.asarray(found.com), np.asarray(found.inertia), errors)
     volume = float(moments.volume)
     mass = part.mass if part.mass is not None else float(part.density or 0.0) * volume
     second = np.asarray(moments.second_moment, float) * mass / volume
@@ -266,9 +322,7 @@ def _sum(weights: Sequence[_Weight], dtype) -> MassProperties:
     for weight in weights:
         arm = weight.com - com
         inertia += weight.inertia + weight.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    errors = [
-        np.sqrt(sum(np.asarray(weight.errors[k]) ** 2 for weight in weights)) for k in range(3)
-    ]
+    errors = [np.sqrt(sum(np.asarray(weight.errors[k]) ** 2 for weight in weights)) for k in range(3)]
     return MassProperties(
         jnp.asarray(mass, dtype),
         jnp.asarray(com, dtype),
@@ -286,7 +340,7 @@ def _fits(parts: Sequence[Part], shapes: Sequence[AbstractShape], size: float) -
         ValueError: If one overlaps another by much.
     """
     said, touches = [], np.eye(len(parts), dtype=bool)
-    for i, j in ((i, j) for i in range(len(parts)) for j in range(i + 1, len(parts))):
+    for i, j in itertools.combinations(range(len(parts)), 2):
         depth = [_share_within(shapes[i], shapes[j]), _share_within(shapes[j], shapes[i])]
         a, b = parts[i].name, parts[j].name
         inner = i if depth[0][0] >= depth[1][0] else j
@@ -295,12 +349,15 @@ def _fits(parts: Sequence[Part], shapes: Sequence[AbstractShape], size: float) -
         touches[i, j] = touches[j, i] = gap < _APART * size
         if share > _OVERLAPS:
             raise ValueError(
-                f"{a} and {b} overlap: {100 * share:.0f} % of {parts[inner].name} lies in the other part and would"
-                " weigh twice; cut it out of one of them (or check that their files share a frame and units)"
+                f"{a} and {b} overlap: {100 * share:.0f} % of {parts[inner].name} lies in the other part and"
+                " would weigh twice; cut it out of one of them (or check that their files share a frame and"
+                " units)"
             )
         if share > 0.05 * _OVERLAPS:
-            said.append(f"{a} and {b} overlap by {100 * share:.1f} % of {parts[inner].name}, which weighs twice")
-    reached = touches[0]
+            said.append(
+                f"{a} and {b} overlap by {100 * share:.1f} % of {parts[inner].name}, which weighs twice"
+            )
+    reached: np.ndarray = touches[0]
     for _ in parts:
         reached = touches[reached].any(axis=0)
     if not reached.all():

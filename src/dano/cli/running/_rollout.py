@@ -13,6 +13,7 @@ from dano.cli._console import Progress, put, say
 from dano.cli.running._checkpoint import Checkpoint
 from dano.cli.running._clock import Clock
 from dano.engine import contact_history
+from dano.names import see
 from dano.scene import (
     JOINT_QUANTITIES,
     Layout,
@@ -232,5 +233,5 @@ def warn_unconverged(report: dict[str, Any]) -> None:
         say(
             f"warning: {count} of {report['steps']} steps did not converge, first step {first} "
             f"(t = {first * report['timestep']:.4g} s), largest residual {report['largest_residual']:.3g} "
-            "m/s; try a smaller --timestep"
+            f"m/s; try a smaller --timestep; {see('steps-did-not-converge')}"
         )

@@ -20,6 +20,7 @@ from dano.engine.batches._devices import device_mesh, gather, meet, put_rows, pu
 from dano.engine.batches._input import checked_job, Job
 from dano.engine.batches._kernel import Kept, simulate_rows
 from dano.engine.batches._store import RolloutStore
+from dano.names import see
 from dano.scene import Control, JOINT_QUANTITIES, Scene, State, STATE_SIZES
 
 Progress = Callable[[str, float], None]
@@ -341,10 +342,11 @@ def _say_unconverged(of_rollouts: Array | np.ndarray) -> None:
     first = np.asarray(of_rollouts)
     failed = np.flatnonzero(first >= 0)
     if len(failed):
+        page = see("steps-did-not-converge")
         warnings.warn(
             f"{len(failed)} of {len(first)} rollouts have steps that did not converge, first rollout "
             f"{failed[0]} at step {first[failed[0]]}; try a smaller timestep, or where many points touch a "
-            "larger VariationalEngine(capacity=…); with CentroidLaw a smaller damper or smoothing",
+            f"larger VariationalEngine(capacity=…); with CentroidLaw a smaller damper or smoothing; {page}",
             RuntimeWarning,
             stacklevel=3,
         )
