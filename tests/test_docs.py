@@ -24,7 +24,11 @@ PROGRAMS = {
 # Pages whose programs take a minute each to compile; what they show has tests of its own beside it.
 LONG = ("docs/arm.md", "docs/identify.md", "docs/joints.md", "docs/learn.md", "docs/robots.md")
 # Packages that few have.
-NEEDS = {"docs/arm.md": ("pybullet_data",), "docs/worlds.md": ("newton", "pxr")}
+NEEDS = {
+    "docs/arm.md": ("pybullet_data",),
+    "docs/splats.md": ("mujoco_warp",),
+    "docs/worlds.md": ("newton", "pxr"),
+}
 # Of the command line, the commands are what is public.
 PACKAGES = [p for p in sorted((REPOSITORY / "src" / "dano").glob("*/__init__.py")) if p.parent.name != "cli"]
 WIDEST = 90

@@ -64,8 +64,9 @@ def test_the_factor_converges_with_the_step():
     assert errors[2] < 0.04 * 0.25
 
 
+@pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
 def test_where_contact_is_sharp():
-    """Between boxes, cylinders and half-spaces; not where a body is round, or a spring has impacts."""
+    """Of boxes and cylinders on half-spaces; not where a body is round, or a spring has impacts."""
     cylinder, ball = dano.Cylinder(0.05, 0.05), dano.Sphere(0.05)
 
     def params(shape, law=None, timestep=1e-3, **given):
@@ -77,24 +78,29 @@ def test_where_contact_is_sharp():
     for shape in (box, cylinder):
         sharp = params(shape)
         assert float(sharp.impact_depth) == pytest.approx(9.81e-6)
-        assert float(sharp.stiffness) > 1e12
-    assert float(params(box, timestep=1e-4).impact_depth) == pytest.approx(1e-6)
-    assert float(params(box, timestep=1e-2).impact_depth) == pytest.approx(5e-4)
+        assert float(sharp.stiffness) > 20 * float(params(ball).stiffness)
+    assert float(params(box, timestep=1e-4).impact_depth) == pytest.approx(1e-6, rel=0.01)
+    assert float(params(box, timestep=1e-2).impact_depth) == pytest.approx(5e-4, rel=0.01)
     for soft in (params(rounded), params(ball), params(box, dano.DistributedLaw(compliant=True))):
-        assert float(soft.impact_depth) == pytest.approx(5e-4)
-        assert float(soft.stiffness) < 1e11
+        assert float(soft.impact_depth) == pytest.approx(5e-4, rel=0.01)
+        assert float(soft.stiffness) < float(params(box).stiffness) / 20
     given = params(box, stiffness=1e6, impact_depth=1e-3)
     assert (float(given.stiffness), float(given.impact_depth)) == pytest.approx((1e6, 1e-3))
 
 
-def test_among_others_all_are_sharp_or_none():
-    """Unnamed pairs take their parameters from two bodies each: one that is round makes all soft."""
+def test_among_others_a_plane_is_sharp_where_nothing_round_meets_it():
+    """Unnamed pairs take their parameters from two bodies each: boxes are soft to each other."""
     boxes = [dano.Body(name, dano.Box((0.05,) * 3), mass=1.0) for name in "ab"]
 
     def depths(bodies):
         scene = dano.Scene.create([*bodies, FLOOR], others=dano.ContactParams(), timestep=1e-3)
         assert scene.others is not None
-        return np.asarray(scene.others.pair_params.impact_depth)
+        floor = [scene.names[j] == "floor" for _, j in scene.others.pairs]
+        found = np.asarray(scene.others.pair_params.impact_depth)
+        return found[floor], found[~np.array(floor)]
 
-    np.testing.assert_allclose(depths(boxes), 9.81e-6)
-    np.testing.assert_allclose(depths([*boxes, dano.Body("c", dano.Sphere(0.05), mass=1.0)]), 5e-4)
+    on_floor, apart = depths(boxes)
+    np.testing.assert_allclose(on_floor, 9.81e-6)
+    np.testing.assert_allclose(apart, 5e-4, rtol=0.01)
+    ball = dano.Body("c", dano.Sphere(0.05), mass=1.0)
+    np.testing.assert_allclose(np.concatenate(depths([*boxes, ball])), 5e-4, rtol=0.01)

@@ -91,8 +91,8 @@ def test_seeds_options_and_attributes(pushed, env):
 
 def test_it_learns(env):
     """A policy gradient finds that pushing towards the goal pays: rewards rise."""
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.vec_env import VecMonitor
+    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.vec_env import VecMonitor  # pyright: ignore[reportMissingImports]
 
     watched = VecMonitor(env)
     model = PPO("MlpPolicy", watched, n_steps=64, batch_size=64, learning_rate=3e-3, seed=0, device="cpu")

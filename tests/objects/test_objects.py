@@ -1,5 +1,7 @@
 """From a field to an object: samples, thresholds, mass models, floaters and hollow cores, files."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -152,7 +154,7 @@ def test_save_and_load(solid_ball, tmp_path):
 def test_a_centre_of_mass_far_beside_the_samples_is_refused():
     """Where a body's samples lie, there is its mass; samples of one side alone may be beside it."""
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
-    known = dict(points=points, density=np.ones(50), mass=1.0, inertia=1e-3 * np.eye(3))
+    known: dict[str, Any] = dict(points=points, density=np.ones(50), mass=1.0, inertia=1e-3 * np.eye(3))
     assert dano.NeuralObject.from_samples(com=(0.0, 0.0, 0.2), **known).mass.com[2] == 0.2
     with pytest.raises(ValueError, match="com must lie within the body .*, 9.9 m beside points that span"):
         dano.NeuralObject.from_samples(com=(10.0, 0.0, 0.0), **known)
@@ -165,7 +167,7 @@ def test_a_distance_in_place_of_a_density_is_said(signed: bool):
     places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     distance = np.linalg.norm(places, axis=-1) - 0.1
     values = np.abs(distance) if signed else np.maximum(distance, 0)
-    made = dict(n_samples=200, resolution=24)
+    made: dict[str, Any] = dict(n_samples=200, resolution=24)
     with pytest.warns(UserWarning, match="grows evenly to the border .* as a distance does"):
         dano.NeuralObject.from_field(dano.GridField(values, axis[[0, 0, 0]], axis[1] - axis[0]), **made)
     # Neither a ball nor a box's walls, which are dense where their grid ends, grow evenly.

@@ -157,6 +157,17 @@ def test_limits_of_a_length_that_joints_keep_are_no_matter(tmp_path):
         dano.load_mjcf(written(tmp_path, COUPLED.format(**keys)), collision=False)
 
 
+def test_limits_that_exclude_each_other_are_refused(tmp_path):
+    """Of a joint, and of the one that follows it the other way: together they leave nothing but zero."""
+    keys = dict.fromkeys(("a", "b", "t", "u", "equality"), "")
+    keys |= dict(a='range="0 1"', b='range="0 1"', equality='<joint joint1="b" joint2="a" polycoef=".2 -2"/>')
+    path = written(tmp_path, COUPLED.format(**keys).replace('ref=".1"', 'ref="0"'))
+    assert dano.load_mjcf(path, collision=False).joints[0].limits.tolist() == [0.0, pytest.approx(0.1)]
+    path.write_text(path.read_text().replace('".2 -2"', '"0 -2"'))
+    with pytest.raises(ValueError, match=r"limits of joint 'b' leave no way to 'a'.*ignore=\['equalities'\]"):
+        dano.load_mjcf(path, collision=False)
+
+
 def test_lengths_of_three_joints_are_refused(tmp_path):
     keys = dict.fromkeys(("a", "b", "t", "u", "equality"), "")
     keys["equality"] = '<tendon tendon1="t" tendon2="u"/>'

@@ -170,12 +170,14 @@ class Build:
 class Import:
     """Read a field of another program and write it as a grid that dano reads.
 
+    With `--to`, Gaussian splats become an object in a folder that MuJoCo or Newton loads, splats included.
+
     Attributes:
         file: nerfstudio checkpoint (.ckpt), instant-ngp snapshot (.ingp, .msgpack), Gaussian splats (.ply),
             OpenVDB or NanoVDB grid (.vdb, .nvdb), PyTorch module (.pt2, .pt, .pth), voxels (.npy, .npz),
             model of dano (.npz), mesh (.obj, .stl, .ply, .off, .glb, .gltf, .3mf, .dae, .step), a shipped one
             (bunny, soap, trained_bunny, trained_soap), or a function as package.module:name.
-        output: Where to write the grid (.npz).
+        output: Where to write the grid (.npz), or with --to the folder.
         crop: Box to keep: lowest x y z, highest x y z, in the file's frame and units.
         scale: Length of a unit of the file [m]; default: as meshes say or their size tells, else 1.
         units: The same by name.
@@ -186,6 +188,11 @@ class Import:
             as their walls need.
         interpolation: How the grid is interpolated between its nodes; default: as the format has it.
         skip_nan: Gaussian splats: leave out those with numbers that are not finite; how many is said.
+        box: Gaussian splats: take one object out of a scene, the Gaussians whose centre lies in this box:
+            lowest x y z, highest x y z, in the file's frame and units.
+        sphere: The same for a sphere: centre x y z, radius.
+        to: Gaussian splats: write a folder as `dano export` does, with the Gaussians for cameras: mjcf, usd.
+        mass: With --to: mass of the object [kg]; default: as dense as water.
         hollow: Gaussian splats: do not fill the inside. Splats lie on surfaces, so their inside is empty.
         spacing: Voxels (.npy): distance between voxels in the file's units; default: longest side 1.
         origin: Voxels (.npy): centre of the first voxel.
@@ -209,6 +216,10 @@ class Import:
     resolution: int | None = None
     interpolation: Literal["linear", "quadratic", "cubic"] | None = None
     skip_nan: bool = False
+    box: tuple[float, float, float, float, float, float] | None = None
+    sphere: tuple[float, float, float, float] | None = None
+    to: tuple[Literal["mjcf", "urdf", "usd", "obj"], ...] = ()
+    mass: float | None = None
     hollow: bool = False
     spacing: float | None = None
     origin: tuple[float, float, float] | None = None

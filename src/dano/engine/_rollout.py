@@ -133,6 +133,20 @@ class VariationalEngine(AbstractEngine):
         return _touching.wrenches(scene, prepared.tables, prepared.capacity, before, after, about)
 
 
+def _check_one(scene: Scene, state: State) -> None:
+    """`check_state` of what must be one state.
+
+    Raises:
+        ValueError: As there, or if there are several.
+    """
+    check_state(scene, state)
+    if state.position.ndim != 2:
+        raise ValueError(
+            f"state must be one state, with positions of shape {(len(scene.bodies), 3)}, got"
+            f" {state.position.shape}: dano.rollouts simulates many, and jax.vmap does"
+        )
+
+
 def check_state(scene: Scene, state: State) -> None:
     """`Scene.check_state`, after the scene itself; and whether loops are closed.
 
@@ -180,7 +194,7 @@ def step(
     Raises:
         ValueError: If the state or control does not fit the scene.
     """
-    check_state(scene, state)
+    _check_one(scene, state)
     check_control(scene, control, ())
     following, report = _with_room(engine, scene, lambda engine: _jitted_step(engine, scene, state, control))
     _say(scene, following, report)
@@ -226,7 +240,7 @@ def simulate(
     """
     checked_kind("scene", scene, Scene)
     state = scene.initial_state() if state is None else state
-    check_state(scene, state)
+    _check_one(scene, state)
     n_steps = n_steps if duration is None else _steps(n_steps, duration, scene.timestep)
     controls, n_steps = spread(scene, controls, n_steps)
     if checkpoint_every is not None:
@@ -287,7 +301,7 @@ def linearize(
     Raises:
         ValueError: If the state or control does not fit the scene.
     """
-    check_state(scene, state)
+    _check_one(scene, state)
     check_control(scene, control, ())
     return _jitted_linearize(checked_engine(engine), scene, state, control)
 

@@ -8,9 +8,13 @@ from jaxtyping import Float
 from dano.contact import ContactParams
 from dano.exchange._look import Texture
 from dano.exchange._triangles import Triangles
+from dano.fields import Splats
 
 MESHES = "meshes"
 """Folder of the meshes, in that of the object."""
+
+SPLATS, SURROUNDINGS = "splats", "surroundings"
+"""Names of the Gaussians of the object, and of what does not move with it."""
 
 VISUAL = "visual"
 """Name of the visual mesh, its material and its picture."""
@@ -30,6 +34,8 @@ class Contents(NamedTuple):
         texture: Its colours, if they are known.
         pieces: Convex solids whose union stands for the object in contact.
         contact: Parameters of its contacts.
+        splats: Gaussians that it is drawn with, if it was seen by them.
+        surroundings: Those of what does not move with it.
     """
 
     name: str
@@ -42,6 +48,8 @@ class Contents(NamedTuple):
     texture: Texture | None
     pieces: list[Triangles]
     contact: ContactParams
+    splats: Splats | None = None
+    surroundings: Splats | None = None
 
     @property
     def friction(self) -> float:

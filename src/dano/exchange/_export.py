@@ -23,11 +23,12 @@ from dano.checks import (
 )
 from dano.contact import ContactParams
 from dano.exchange import _mjcf, _urdf, _usd
-from dano.exchange._contents import Contents, MESHES, VISUAL
+from dano.exchange._contents import Contents, MESHES, SPLATS, SURROUNDINGS, VISUAL
 from dano.exchange._look import painted, PLAIN
 from dano.exchange._pieces import chosen_collision, convex_hull, decomposition
 from dano.exchange._triangles import solid_triangles, Triangles
 from dano.exchange._wavefront import write_image, write_material, write_obj
+from dano.fields import Splats
 from dano.memory import check_nodes
 from dano.objects import NeuralObject
 
@@ -86,7 +87,8 @@ def export_object(
     *,
     to: str | Sequence[str] = "mjcf",
     name: str | None = None,
-    look: "LearnedField | None" = None,
+    look: "LearnedField | Splats | None" = None,
+    surroundings: Splats | None = None,
     contact: ContactParams | None = None,
     collision: str = "auto",
     concavity: float = 0.05,
@@ -107,7 +109,9 @@ def export_object(
         to: Formats: "mjcf" (MuJoCo), "urdf" (ROS, PyBullet, Drake, …), "usd" (Isaac, Newton), "obj" (meshes
             only). Meshes are written whatever the format.
         name: Of the body and the files; default: the folder's.
-        look: What photographs have taught, for colours.
+        look: What photographs have taught, for colours; or Gaussian splats in the object's frame, which are
+            written beside the meshes, with the object itself, `NAME.dano`.
+        surroundings: Gaussians of what does not move with the object, in the same frame.
         contact: Parameters of its contacts; default `ContactParams()`. Friction goes into every format but
             OBJ, restitution into USD, stiffness into USD for Newton, the rest nowhere.
         collision: "coacd": convex decomposition; "hull": convex hull; "auto": the first if CoACD is
@@ -131,8 +135,12 @@ def export_object(
     formats = _checked_formats(to)
     name = _checked_name(_default_name(target) if name is None else name)
     contact = checked_optional("contact", contact, ContactParams) or ContactParams()
-    if look is not None and not hasattr(look, "model"):
-        raise ValueError(f"look must be a dano.vision.LearnedField, got {type(look).__name__}")
+    splats, learned = (look, None) if isinstance(look, Splats) else (None, look)
+    if learned is not None and not hasattr(learned, "model"):
+        raise ValueError(
+            f"look must be a dano.vision.LearnedField or dano.fields.Splats, got {type(look).__name__}"
+        )
+    checked_optional("surroundings", surroundings, Splats)
     if progress is not None:
         checked_function("progress", progress)
     how = chosen_collision(collision)
@@ -157,12 +165,14 @@ def export_object(
         mesh=mesh,
         resolution=resolution,
         normals=normals,
-        texture=None if look is None else painted(look, mesh, normals, texture_size),
+        texture=None if learned is None else painted(learned, mesh, normals, texture_size),
         pieces=pieces,
         contact=contact,
+        splats=splats,
+        surroundings=surroundings,
     )
     say("files", 0.9)
-    exported = _written(target, contents, formats, how)
+    exported = _written(target, obj, contents, formats, how)
     say("done", 1.0)
     return exported
 
@@ -197,7 +207,7 @@ def _default_name(folder: Path) -> str:
 def _checked_name(name: str) -> str:
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"name must be a letter, then letters, digits and underscores, got {name!r}")
-    if name in ("scene", MESHES):
+    if name in ("scene", SURROUNDINGS, MESHES):
         raise ValueError(f"name must not be {name!r}, which other files of the folder are called")
     return name
 
@@ -245,7 +255,7 @@ def _listed(folder: Path) -> set[str]:
         return set()
 
 
-def _written(target: Path, contents: Contents, formats: list[str], how: str) -> Exported:
+def _written(target: Path, obj: NeuralObject, contents: Contents, formats: list[str], how: str) -> Exported:
     """Write all files beside the folder, then put them in its place."""
     place = target.resolve()
     work = Path(tempfile.mkdtemp(dir=place.parent, prefix=f".{place.name}."))
@@ -254,6 +264,7 @@ def _written(target: Path, contents: Contents, formats: list[str], how: str) -> 
         fresh = work / place.name
         fresh.mkdir()
         _write_meshes(fresh / MESHES, contents)
+        _write_splats(fresh, obj, contents)
         for form in formats:
             _WRITERS[form](fresh, contents)
         notes = _notes(contents, formats, how)
@@ -302,6 +313,15 @@ def _write_meshes(folder: Path, contents: Contents) -> None:
         write_obj(folder / f"{piece}.obj", hull)
 
 
+def _write_splats(folder: Path, obj: NeuralObject, contents: Contents) -> None:
+    """Gaussians as they are, and the object, whose own contact acts where its bridge is."""
+    if contents.splats is not None:
+        contents.splats.save(folder / f"{SPLATS}.ply")
+        obj.save(folder / f"{contents.name}.dano")
+    if contents.surroundings is not None:
+        contents.surroundings.save(folder / f"{SURROUNDINGS}.ply")
+
+
 def _notes(contents: Contents, formats: list[str], how: str) -> list[str]:
     n = len(contents.pieces)
     pieces = (
@@ -333,6 +353,12 @@ def _notes(contents: Contents, formats: list[str], how: str) -> list[str]:
     ]
     if lost:
         notes.append(f"No format has a place for {', '.join(lost)}.")
+    if contents.splats is not None:
+        notes.append(
+            f"{SPLATS}.ply holds the {len(contents.splats)} Gaussians in the frame of the files, for"
+            " MuJoCo Warp (`create_render_context`) and all programs for splats; in USD they are on the body,"
+            f" and Newton reads them. {contents.name}.dano is the object, for dano.mujoco.Bridge."
+        )
     return [*notes, *(note for form in formats for note in _NOTES[form])]
 
 

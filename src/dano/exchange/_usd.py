@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dano.exchange._contents import Contents, VISUAL
+from dano.exchange._contents import Contents, SPLATS, SURROUNDINGS, VISUAL
 from dano.exchange._look import PLAIN
 from dano.exchange._triangles import Triangles
 from dano.extras import optional
+from dano.fields import Splats
 from dano.maths import quat_from_matrix
 
 NOTES = (
@@ -61,8 +62,18 @@ def write_usd(folder: Path, contents: Contents) -> list[str]:
         with variants.GetVariantEditContext():
             write(stage, contents, material)
     variants.SetVariantSelection(next(iter(_COLLISIONS)))
+    if contents.splats is not None:
+        _write_splats(stage, f"/{contents.name}/{SPLATS}", contents.splats)
     stage.GetRootLayer().Save()
-    return [path.name]
+    if contents.surroundings is None:
+        return [path.name]
+    around = Usd.Stage.CreateNew(str(folder / f"{SURROUNDINGS}.usd"))
+    UsdGeom.SetStageUpAxis(around, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(around, 1.0)
+    around.SetDefaultPrim(UsdGeom.Xform.Define(around, f"/{SURROUNDINGS}").GetPrim())
+    _write_splats(around, f"/{SURROUNDINGS}/{SPLATS}", contents.surroundings)
+    around.GetRootLayer().Save()
+    return [path.name, f"{SURROUNDINGS}.usd"]
 
 
 def _write_mass(body: Any, contents: Contents) -> None:
@@ -111,10 +122,35 @@ def _write_look(stage: Any, contents: Contents) -> None:
     colours.Set(_linear(np.array([PLAIN]) if plain else _vertex_colours(contents)))
 
 
+def _write_splats(stage: Any, place: str, splats: Splats) -> None:
+    """Gaussians in the schema that USD has for them."""
+    from pxr import UsdVol, Vt  # pyright: ignore[reportMissingImports]
+
+    seen = UsdVol.ParticleField3DGaussianSplat.Define(stage, place).GetPrim()
+    deviations = np.exp(splats.scales)
+    around = 3 * deviations.max(axis=1, keepdims=True)
+    arrays = {
+        "positions": splats.means,
+        "scales": deviations,
+        "opacities": splats.alphas,
+        "radiance:sphericalHarmonicsCoefficients": splats.colours.reshape(-1, 3),
+        "extent": np.stack([(splats.means - around).min(axis=0), (splats.means + around).max(axis=0)]),
+    }
+    for name, values in arrays.items():
+        seen.GetAttribute(name).Set(np.ascontiguousarray(values, np.float32))
+    # USD keeps quaternions real part last, as NumPy sees them.
+    turns = np.ascontiguousarray(np.roll(splats.rotations, -1, axis=1), np.float32)
+    seen.GetAttribute("orientations").Set(Vt.QuatfArrayFromBuffer(turns))
+    seen.GetAttribute("radiance:sphericalHarmonicsDegree").Set(splats.degree)
+
+
 def _write_pieces(stage: Any, contents: Contents, material: Any) -> None:
     """Convex pieces collide."""
     from pxr import UsdGeom  # pyright: ignore[reportMissingImports]
 
+    if contents.splats is not None:
+        # Drawn instead of it. Where it collides it stays, unseen.
+        stage.OverridePrim(f"/{contents.name}/{VISUAL}").SetActive(False)
     for name, hull in zip(contents.piece_names, contents.pieces, strict=True):
         mesh = _write_mesh(stage, f"/{contents.name}/{name}", hull)
         UsdGeom.Imageable(mesh).CreatePurposeAttr(UsdGeom.Tokens.guide)
@@ -125,7 +161,7 @@ def _write_pieces(stage: Any, contents: Contents, material: Any) -> None:
 
 def _write_newton_distance(stage: Any, contents: Contents, material: Any) -> None:
     """What is seen collides, in Newton by its signed distance."""
-    surface = stage.OverridePrim(f"/{contents.name}/{VISUAL}")
+    surface = _surface(stage, contents)
     _let_collide(surface, "none", material)
     nodes = _TILE * math.ceil(contents.resolution / _TILE)
     _apply(surface, "NewtonCollisionAPI", {})
@@ -142,11 +178,21 @@ def _write_newton_distance(stage: Any, contents: Contents, material: Any) -> Non
 
 def _write_physx_distance(stage: Any, contents: Contents, material: Any) -> None:
     """What is seen collides, in PhysX by its signed distance."""
-    surface = stage.OverridePrim(f"/{contents.name}/{VISUAL}")
+    surface = _surface(stage, contents)
     _let_collide(surface, "sdf", material)
     _apply(surface, "PhysxCollisionAPI", {})
     resolution = {"physxSDFMeshCollision:sdfResolution": ("UInt", contents.resolution)}
     _apply(surface, "PhysxSDFMeshCollisionAPI", resolution)
+
+
+def _surface(stage: Any, contents: Contents) -> Any:
+    """The visible mesh, unseen where Gaussians are drawn instead."""
+    from pxr import UsdGeom  # pyright: ignore[reportMissingImports]
+
+    surface = stage.OverridePrim(f"/{contents.name}/{VISUAL}")
+    if contents.splats is not None:
+        UsdGeom.Imageable(surface).CreateVisibilityAttr(UsdGeom.Tokens.invisible)
+    return surface
 
 
 _COLLISIONS = {

@@ -53,6 +53,8 @@ is solid (convention)."""
 _UNEVEN, _CAVITY, _HAZE = 0.1, 0.02, 0.01
 """Unevenness, share of hollow volume and share of density outside, from which mass does not follow density
 (convention)."""
+_DENSE, _FOOT = 0.5, 0.1
+"""Share of the largest density that is a wall, and of the height that is the foot of what stands."""
 
 
 class Interior(eqx.Module):
@@ -150,13 +152,15 @@ def examine(lattice: Lattice) -> tuple[Interior, Bool[np.ndarray, "nx ny nz"]]:
     return _described(values, level * scale, stated, inside, solid(level / 2, gap)), inside
 
 
-def fill_hollows(grid: GridField) -> tuple[GridField, Interior]:
+def fill_hollows(grid: GridField, *, stood: bool = False) -> tuple[GridField, Interior]:
     """A shell of density as a solid: what it encloses gets the density of its wall.
 
     Gaussian splats and many radiance fields are shells. Pores of up to four cells are closed if need be.
 
     Args:
         grid: Density.
+        stood: It stood on a table, with z up, and was seen from above: a shell that is open at its foot is
+            closed there first.
 
     Returns:
         The grid whose nodes inside the solid have at least the density of the wall, and what `grid` was like
@@ -164,9 +168,24 @@ def fill_hollows(grid: GridField) -> tuple[GridField, Interior]:
     """
     checked_kind("grid", grid, GridField)
     origin, spacing = np.asarray(grid.origin, np.float64), np.asarray(grid.spacing, np.float64)
-    lattice = Lattice(node_values(grid), origin, spacing)
+    values = node_values(grid)
+    lattice = Lattice(_closed_below(values) if stood and values.any() else values, origin, spacing)
     interior, inside = examine(lattice)
     return sealed(lattice, interior, inside), interior
+
+
+def _closed_below(values: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "nx ny nz"]:
+    """Densities with a wall across the lowest layers: in the one whose outline encloses most."""
+    from scipy import ndimage
+
+    dense = values > _DENSE * values.max()
+    layers = np.flatnonzero(dense.any(axis=(0, 1)))
+    lowest = layers[0] + np.arange(max(1, round(_FOOT * len(layers))))
+    filled = [ndimage.binary_fill_holes(dense[:, :, k]) for k in lowest]
+    best = int(np.argmax([layer.sum() for layer in filled]))
+    closed = values.copy()
+    closed[:, :, lowest[best]][filled[best]] = values.max()
+    return closed
 
 
 def node_values(grid: GridField) -> Float[np.ndarray, "nx ny nz"]:

@@ -197,17 +197,19 @@ class Body(eqx.Module):
         """What other bodies' surface samples press on: the shape, or the object's signed distance."""
         return self.shape if self.object is None else self.object.solid
 
-    def is_sharp(self, other: "Body") -> bool:
-        """Whether the surface is known exactly where the body touches another one.
-
-        Those of boxes without rounding, of cylinders and of half-spaces are. Of a neural object of flat faces
-        the samples are but not the solid; a half-space has no samples that press on it.
-        """
+    @property
+    def is_flat(self) -> bool:
+        """Whether edges and faces of the surface are known exactly; of objects, those of flat faces are."""
         if self.object is not None:
-            return isinstance(other.shape, HalfSpace) and self.object.is_flat
+            return self.object.is_flat
         if isinstance(self.shape, Box):
             return not is_traced(self.shape.rounding) and float(self.shape.rounding) == 0
-        return isinstance(self.shape, Cylinder | HalfSpace)
+        return isinstance(self.shape, Cylinder)
+
+    @property
+    def is_plane(self) -> bool:
+        """Whether the body is a half-space."""
+        return isinstance(self.shape, HalfSpace)
 
     @property
     def centre_of_mass(self) -> Float[Array, "3"]:

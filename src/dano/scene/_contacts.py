@@ -126,7 +126,7 @@ def prepared(
         a, b = by_name[contact.a], by_name[contact.b]
         stiffness = functools.partial(_stiffness, a, b, weight, carried)
         size = min(sizes[a.name], sizes[b.name])
-        sharp = a.is_sharp(b) and b.is_sharp(a)
+        sharp = (a.is_plane and b.is_flat) or (b.is_plane and a.is_flat)
         setting = Setting(size, strength, stiffness, timestep, sharp)
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))

@@ -35,6 +35,12 @@ _STRONGEST = 100.0
 """Gravity [m/s²] beyond that of all planets, and of centrifuges for people."""
 _FAR = 3.0
 """Sizes from a body's middle at which an anchor, or a centre of mass, is rather given in another frame."""
+_WIDEST_EDGE = 1.0
+"""Share of a shape's thickness from which the smooth edge reaches through it."""
+_COARSE = 1e-3
+"""Share of a body's size by which places may be rounded."""
+_SHORTEST = 1e-7
+"""Timestep [s] below which it is rather given in another unit."""
 _TURNS = 10.0
 """Whole numbers beyond these, as limits of a hinge, are rather degrees [rad]."""
 _LEAPS = 10.0
@@ -131,12 +137,13 @@ def _too_soft(contact: Contact, bodies: Sequence[Body], gravity: Float[Array, "3
         if is_traced(body.surface, body.mass, body.mass_scale, body.scale) or not np.isfinite(body.size):
             continue
         weight = float(body.mass * body.mass_scale) * float(np.linalg.norm(np.asarray(gravity)))
+        other = contact.b if body.name == contact.a else contact.a
         if float(stiffness) * body.typical_support(_SOFT * body.size) < weight:
             found.append(
                 Doubt(
                     3,
                     f"{body.name!r} sinks by more than {100 * _SOFT:.0f} % of its size where it rests: its"
-                    f" stiffness of {float(stiffness):.3g} Pa/m with {contact.a!r} or {contact.b!r} is small",
+                    f" stiffness of {float(stiffness):.3g} Pa/m with {other!r} is small",
                 )
             )
     return found
@@ -195,6 +202,10 @@ def _of_body(body: Body) -> list[Doubt]:
         )
         found.append(Doubt(3, text))
     thin = _thickness(body)
+    edge = getattr(body.shape, "edge", None)
+    if edge is not None and not is_traced(edge) and float(edge) > _WIDEST_EDGE * thin:
+        text = f"the edge of {body.name!r} is {float(edge):.3g} m wide and its shape {thin:.3g} m thick"
+        found.append(Doubt(3, f"{text}: it has no inside"))
     if thin < _THINNEST * body.size:
         text = f"{body.name!r} is {thin:.2g} m thick and {body.size:.2g} m long: too thin for its samples"
         found.append(Doubt(5, text))
@@ -269,8 +280,14 @@ def doubts_of_state(
     found = []
     position, speeds = np.asarray(state.position, np.float64), np.asarray(state.velocity, np.float64)
     spins, orientation = np.asarray(state.omega, np.float64), np.asarray(state.orientation, np.float64)
+    rounding = float(np.finfo(state.position.dtype).eps)
     for i in layout.free:
         body = bodies[i]
+        far = float(np.abs(position[i]).max())
+        if np.isfinite(body.size) and far * rounding > _COARSE * body.size:
+            apart = f"where numbers are {far * rounding:.1g} m apart"
+            text = f"{body.name!r} lies {far:.3g} m from the origin, {apart}"
+            found.append(Doubt(2, f"{text}: is its position in metres?"))
         way = float(np.linalg.norm(speeds[i])) * timestep
         if np.isfinite(body.size) and way > _LEAPS * body.size and way > 0:
             found.append(
@@ -297,11 +314,30 @@ def doubts_of_state(
         names = ", ".join(repr(bodies[i].name) for i in layout.free[:3])
         text = f"orientation [0, 0, 0, 1] of {names} is a half turn about z: quaternions are wxyz"
         found.append(Doubt(4, f"{text}, and no turn is [1, 0, 0, 0]"))
+    found += _of_coordinates(bodies, layout, state)
+    if timestep < _SHORTEST:
+        text = (
+            f"timestep {timestep:.3g} s is short: a second takes {1 / timestep:.2g} steps; is it in seconds?"
+        )
+        found.append(Doubt(3, text))
     for i, body in enumerate(bodies):
         if body.fixed and (np.any(speeds[i]) or np.any(spins[i])):
             found.append(Doubt(3, f"{body.name!r} is fixed: the velocity of its state moves nothing"))
     for i, j in pairs:
         found += _begins_inside(bodies, position, orientation, i, j)
+    return found
+
+
+def _of_coordinates(bodies: Sequence[Body], layout: Layout, state: State) -> list[Doubt]:
+    """Angles of hinges that are rather in degrees."""
+    found = []
+    for joint, _, place in layout.dofs:
+        if state.q is None or layout.kinds[joint] != "hinge" or layout.follows[joint]:
+            continue
+        q = float(state.q[place])
+        if abs(q) > _TURNS and q == round(q):
+            name, turns = bodies[layout.children[joint]].name, abs(q) / (2 * np.pi)
+            found.append(Doubt(4, f"q of {name!r} is {q:g} rad, {turns:.3g} turns: is it in degrees?"))
     return found
 
 

@@ -194,11 +194,12 @@ def _stacked(
         decide = [i] if i in moving else moving
         return lambda sinking: functools.reduce(jnp.minimum, [stiffness(k, sinking) for k in decide])
 
-    # What is soft against one of them is so against all.
-    sharp = all(bodies[i].is_sharp(bodies[j]) and bodies[j].is_sharp(bodies[i]) for i, j in pairs)
+    # Of two bodies the stiffer and shallower one counts: a plane is that, where nothing round meets it.
+    met = {i: [bodies[j] for pair in pairs if i in pair for j in pair if j != i] for i in touching}
     complete = []
     for i, body in enumerate(bodies):
         given = usual if body.material is None else body.material
         size = min(body.size, largest)
+        sharp = body.is_plane and all(other.is_flat for other in met.get(i, ()))
         complete.append(law.complete(given, Setting(size, strength, rule(i), timestep, sharp)))
     return jax.tree.map(lambda *x: jnp.stack(x), *complete)

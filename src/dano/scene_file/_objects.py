@@ -30,6 +30,8 @@ ASSETS = {"bunny": 1.0, "soap": 0.15, "trained_bunny": 1.0, "trained_soap": 0.15
 """Shipped objects and their masses [kg]."""
 
 _TRAINED = "trained_"
+_ROBOTS = (".urdf", ".xml", ".mjcf", ".xacro")
+"""What files of robots end in."""
 _WATER = 1000.0
 """Density [kg/m³] of what is built of a mesh unasked."""
 
@@ -211,6 +213,11 @@ def load_object(
         )
     if path.is_file() and format_of(path) == TRAJECTORY[0]:
         raise ValueError(f"{path} is a run, not an object: `dano view {path}` shows it")
+    if path.suffix.lower() in _ROBOTS:
+        raise ValueError(
+            f"{path} is a robot's file, not an object: `dano inspect {path}` shows it, and [[robots]] in a"
+            " scene file simulates it"
+        )
     if path.suffix.lower() == ".dano" or path.suffix.lower() not in FIELD_SUFFIXES:
         return NeuralObject.load(path)
     return object_of_file(path, options, weighed=weighed, progress=progress)

@@ -55,7 +55,7 @@ _CHECKPOINT = (
     "disable_scene_contraction",
 )
 _MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge", "up"))
-_SPLATS = _Reader(load_splats, ("min_width", "skip_nan"), crops=True)
+_SPLATS = _Reader(load_splats, ("min_width", "skip_nan", "box", "sphere"), crops=True)
 _READERS: dict[str, _Reader] = {
     ".npz": _Reader(load_npz, ("interpolation",)),
     ".npy": _Reader(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
@@ -112,7 +112,8 @@ def load_field(
     - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`, `.3mf`, `.dae`, `.step`: a triangle mesh; options of
       `mesh_field`, which says what it mends.
     - `.ply` with Gaussian splats, flat (2DGS) and packed (`.compressed.ply`) ones, too: their occupancy;
-      options `min_width`, the least standard deviation of a Gaussian, and `skip_nan`.
+      options `min_width`, the least standard deviation of a Gaussian, `skip_nan`, and `box` or `sphere`,
+      which take one object out of a scene.
     - `.ckpt`: a nerfstudio checkpoint (nerfacto, splatfacto); option `undo_transform`, and nerfacto's sizes
       where no config.yml tells them.
     - `.ingp`, `.msgpack`: the density grid of an instant-ngp snapshot; options `cascade`, `interpolation`.

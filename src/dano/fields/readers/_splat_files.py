@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from dano.extras import optional
+from dano.fields.readers._gaussians import Splats, Y0
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _CHUNK = 256
@@ -25,12 +26,13 @@ def is_splats(path: Path) -> bool:
     return {b"opacity", b"scale_0", b"rot_0"} <= words or {name.encode() for name in _PACKED} <= words
 
 
-def read_splats(path: Path, *, skip_nan: bool = False) -> dict[str, np.ndarray]:
-    """`means`, log `scales`, `quats` (wxyz) and logit `opacities` of the Gaussians in a .ply file.
+def read_splats(path: str | Path, *, skip_nan: bool = False) -> Splats:
+    """Gaussians of a .ply file as they are, in its frame and units.
 
     Flat Gaussians (2DGS: no scale_2) get a thickness. Packed files (`.compressed.ply` of PlayCanvas and
     SuperSplat) are unpacked: positions and scales of 11, 10 and 11 bits within the ranges of their chunk of
-    256, the three smaller parts of a quaternion of 10 bits each, opacities of 8.
+    256, the three smaller parts of a quaternion of 10 bits each, colours and opacities of 8. Colours that
+    are missing are grey.
 
     Args:
         path: The file.
@@ -40,6 +42,7 @@ def read_splats(path: Path, *, skip_nan: bool = False) -> dict[str, np.ndarray]:
         ValueError: If the file cannot be read, lacks a property, or holds Gaussians that are not finite.
         ImportError: If plyfile is missing.
     """
+    path = Path(path)
     plyfile = optional("plyfile", "reading Gaussian splats needs plyfile", "import")
     try:
         content = plyfile.PlyData.read(str(path))
@@ -53,7 +56,7 @@ def read_splats(path: Path, *, skip_nan: bool = False) -> dict[str, np.ndarray]:
         raise ValueError(
             f"{path}: expected Gaussian splats with {', '.join(_MEMBERS)}, scale_2 (or packed ones); {error}"
         ) from error
-    return _finite(path, parameters, skip_nan)
+    return _finite(path, Splats(**parameters), skip_nan)
 
 
 def _plain(vertices: Any, names: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -69,7 +72,21 @@ def _plain(vertices: Any, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         "scales": np.stack([column[f"scale_{i}"] for i in range(3)], axis=1),
         "quats": np.stack([column[f"rot_{i}"] for i in range(4)], axis=1),
         "opacities": column["opacity"],
+        "colours": _colours(vertices, names),
     }
+
+
+def _colours(vertices: Any, names: tuple[str, ...]) -> np.ndarray:
+    """Coefficients of spherical harmonics, shape (n, k, 3); files list the higher ones channel by channel."""
+    found = np.zeros((len(vertices), 1, 3))
+    if "f_dc_2" not in names:
+        return found
+    found[:, 0] = np.stack([vertices[f"f_dc_{i}"] for i in range(3)], axis=1)
+    higher = max(k for k in (0, 3, 8, 15) if k == 0 or f"f_rest_{3 * k - 1}" in names)
+    if not higher:
+        return found
+    rest = np.stack([vertices[f"f_rest_{i}"] for i in range(3 * higher)], axis=1).astype(np.float64)
+    return np.concatenate([found, rest.reshape(-1, 3, higher).transpose(0, 2, 1)], axis=1)
 
 
 def _unpacked(vertices: Any, chunks: Any) -> dict[str, np.ndarray]:
@@ -103,24 +120,29 @@ def _unpacked(vertices: Any, chunks: Any) -> dict[str, np.ndarray]:
         rows = which == k
         quats[rows] = np.insert(small[rows], k, large[rows], axis=1)
     alpha = np.clip(bits(words["packed_color"], 0, 8), 1e-6, 1 - 1e-6)
+    rgb = np.stack([bits(words["packed_color"], first, 8) for first in (24, 16, 8)], axis=1)
+    if "min_r" in chunks.dtype.names:
+        low, high = (np.stack([chunks[f"{end}_{c}"] for c in "rgb"], axis=1)[chunk] for end in ("min", "max"))
+        rgb = low + rgb * (high - low)
     return {
         "means": within(words["packed_position"], ""),
         "scales": within(words["packed_scale"], "scale_"),
         "quats": quats,
         "opacities": np.log(alpha / (1 - alpha)),
+        "colours": ((rgb - 0.5) / Y0)[:, None],
     }
 
 
-def _finite(path: Path, parameters: dict[str, np.ndarray], skip_nan: bool) -> dict[str, np.ndarray]:
+def _finite(path: Path, splats: Splats, skip_nan: bool) -> Splats:
     """The Gaussians whose numbers are finite, if others may be left out."""
-    count = len(parameters["means"])
-    good = ~np.isnan(parameters["opacities"])
-    for name in ("means", "scales", "quats"):
-        good &= np.isfinite(parameters[name]).all(axis=1)
-    good &= np.linalg.norm(parameters["quats"], axis=1) > 0
+    count = len(splats)
+    good = ~np.isnan(splats.opacities) & np.isfinite(splats.colours).all(axis=(1, 2))
+    for values in (splats.means, splats.scales, splats.quats):
+        good &= np.isfinite(values).all(axis=1)
+    good &= np.linalg.norm(splats.quats, axis=1) > 0
     bad = int(count - good.sum())
     if not bad:
-        return parameters
+        return splats
     if not skip_nan:
         raise ValueError(
             f"{path}: {bad} of {count} Gaussians have numbers that are not finite, or a quaternion of zeros;"
@@ -129,4 +151,4 @@ def _finite(path: Path, parameters: dict[str, np.ndarray], skip_nan: bool) -> di
     warnings.warn(
         f"{path}: left out {bad} of {count} Gaussians that are not finite", UserWarning, stacklevel=4
     )
-    return {name: values[good] for name, values in parameters.items()}
+    return splats.chosen(good)

@@ -22,7 +22,13 @@ _STRAY = 10.0
 
 
 def load_splats(
-    path: Path, *, crop: Numbers | None, min_width: float = 0.0, skip_nan: bool = False
+    path: Path,
+    *,
+    crop: Numbers | None,
+    min_width: float = 0.0,
+    skip_nan: bool = False,
+    box: Numbers | None = None,
+    sphere: Numbers | None = None,
 ) -> CallableField:
     """Occupancy of Gaussian splats in a .ply file, in the frame of the file.
 
@@ -37,15 +43,17 @@ def load_splats(
         min_width: Least standard deviation [units of the file] of a Gaussian along any of its axes; half the
             distance between the nodes of a grid leaves no pores in a shell that is sampled there.
         skip_nan: Leave out Gaussians with numbers that are not finite, which a UserWarning counts.
+        box: Take only Gaussians whose centre lies in this box [units of the file], whole.
+        sphere: The same for a sphere: centre and radius [units of the file], shape (4,).
 
     Raises:
-        ValueError: If `min_width` is negative, the file cannot be read, lacks a property, or holds no
-            Gaussian or numbers that are not finite.
+        ValueError: If `min_width` is negative, no centre is in the box or sphere, the file cannot be read,
+            lacks a property, or holds no Gaussian or numbers that are not finite.
         ImportError: If plyfile is missing.
     """
-    parameters = read_splats(path, skip_nan=skip_nan)
+    splats = read_splats(path, skip_nan=skip_nan)
     try:
-        return splat_field(parameters, crop, min_width)
+        return splat_field(vars(splats.chosen(splats.inside(box, sphere))), crop, min_width)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

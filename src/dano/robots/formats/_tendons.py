@@ -18,7 +18,7 @@ from dano.robots.formats._lacking import EQUALITIES
 _LAWS = ("stiffness", "damping", "frictionloss", "armature")
 _FLAGS = dict(stiffness="SPRING", damping="DAMPER", frictionloss="FRICTIONLOSS", limited="LIMIT")
 _STRAIGHT = 1e-12
-"""Share of its largest coefficient below which a joint does not count in a length."""
+"""Share of its largest coefficient below which a joint does not count, and of a range without width."""
 
 
 class Length(NamedTuple):
@@ -100,7 +100,9 @@ def loaded(
         return joint
     low, high = sorted((end - shift) / ratio for end in limits)
     common = within(joint.limits, (low, high))
-    return None if common is None else dataclasses.replace(joint, limits=common)
+    if common is None or common[1] - common[0] <= _STRAIGHT * (high - low):
+        return None
+    return dataclasses.replace(joint, limits=common)
 
 
 def with_loads_of_followers(joints: list[Connection]) -> tuple[list[Connection], list[Lacking]]:
@@ -124,7 +126,7 @@ def with_loads_of_followers(joints: list[Connection]) -> tuple[list[Connection],
         elif joint.limits is None or joint.limits[0] <= shift <= joint.limits[1]:
             found = joints[rows[leader]]
         if found is None:
-            text = f"limits of joint {joint.name!r} exclude those of {leader!r}, which it follows"
+            text = f"limits of joint {joint.name!r} leave no way to {leader!r}, which it follows"
             lacking.append(Lacking(EQUALITIES, text))
             continue
         joints[rows[leader]] = found
