@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from dano.maths import quat_conjugate, quat_log, quat_multiply
+from dano.robots._parts import FLOATING
 from dano.robots.formats import Connection, Description, Keyframe, Link, Placed
 
-FLOATING = "floating"
 FREE_JOINTS = "free joints"
 """Name by which what acts on free joints is left out."""
 _LAWS = ("damping", "friction", "armature", "stiffness")

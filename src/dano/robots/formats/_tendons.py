@@ -54,16 +54,16 @@ def length_of(shares: Mapping[str, float], joints: list[Connection], held: Mappi
     return Length({name: ratio for name, ratio in ratios.items() if abs(ratio) > least}, shift)
 
 
-def shares_of(model: Any, mujoco: Any, tendon: int, names: list[str]) -> dict[str, float] | None:
-    """Coefficients of a fixed tendon by the names of its joints; None for one of sites."""
+def shares_of(model: Any, mujoco: Any, tendon: int) -> dict[int, float] | None:
+    """Coefficients of a fixed tendon by the indices of its joints; None for one of sites."""
     first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
     rows = range(first, first + count)
     if any(int(model.wrap_type[k]) != int(mujoco.mjtWrap.mjWRAP_JOINT) for k in rows):
         return None
-    found: dict[str, float] = {}
+    found: dict[int, float] = {}
     for k in rows:
-        name = names[int(model.wrap_objid[k])]
-        found[name] = found.get(name, 0.0) + float(model.wrap_prm[k])
+        j = int(model.wrap_objid[k])
+        found[j] = found.get(j, 0.0) + float(model.wrap_prm[k])
     return found
 
 
@@ -141,7 +141,8 @@ class Tendons:
         self.model, self.mujoco, self.off = model, mujoco, off
         self.lacking: list[Lacking] = []
         self.homes = {name: float(model.qpos0[model.jnt_qposadr[j]]) for j, name in enumerate(names)}
-        self.shares = [shares_of(model, mujoco, t, names) for t in range(model.ntendon)]
+        found = [shares_of(model, mujoco, t) for t in range(model.ntendon)]
+        self.shares = [x if x is None else {names[j]: share for j, share in x.items()} for x in found]
 
     def name(self, t: int) -> str:
         return self.model.tendon(t).name or f"tendon {t}"
