@@ -29,10 +29,6 @@ NEEDS = {
     "docs/splats.md": ("mujoco_warp",),
     "docs/worlds.md": ("newton", "pxr"),
 }
-    "docs/arm.md": ("pybullet_data",),
-    "docs/splats.md": ("mujoco_warp",),
-    "docs/worlds.md": ("newton", "pxr"),
-}
 # Of the command line, the commands are what is public.
 PACKAGES = [p for p in sorted((REPOSITORY / "src" / "dano").glob("*/__init__.py")) if p.parent.name != "cli"]
 WIDEST = 90
