@@ -88,19 +88,19 @@ def test_where_contact_is_sharp():
     assert (float(given.stiffness), float(given.impact_depth)) == pytest.approx((1e6, 1e-3))
 
 
-def test_among_others_a_plane_is_sharp_where_nothing_round_meets_it():
-    """Unnamed pairs take their parameters from two bodies each: boxes are soft to each other."""
-    boxes = [dano.Body(name, dano.Box((0.05,) * 3), mass=1.0) for name in "ab"]
-
-    def depths(bodies):
-        scene = dano.Scene.create([*bodies, FLOOR], others=dano.ContactParams(), timestep=1e-3)
-        assert scene.others is not None
-        floor = [scene.names[j] == "floor" for _, j in scene.others.pairs]
-        found = np.asarray(scene.others.pair_params.impact_depth)
-        return found[floor], found[~np.array(floor)]
-
-    on_floor, apart = depths(boxes)
-    np.testing.assert_allclose(on_floor, 9.81e-6)
-    np.testing.assert_allclose(apart, 5e-4, rtol=0.01)
-    ball = dano.Body("c", dano.Sphere(0.05), mass=1.0)
-    np.testing.assert_allclose(np.concatenate(depths([*boxes, ball])), 5e-4, rtol=0.01)
+def test_pairs_that_no_contact_names_are_as_those_that_are_named():
+    """Boxes are sharp on the floor and soft to each other and to a ball; what is set counts as it is."""
+    bodies = [dano.Body(name, dano.Box((0.05,) * 3), mass=1.0) for name in "ab"]
+    bodies += [dano.Body("c", dano.Sphere(0.05), mass=1.0), FLOOR]
+    scene = dano.Scene.create(bodies, others=dano.ContactParams(), timestep=1e-3)
+    assert scene.others is not None
+    found = scene.others.pair_params
+    pairs = [dano.Contact(scene.names[i], scene.names[j]) for i, j in scene.others.pairs]
+    named = dano.Scene.create(bodies, pairs, timestep=1e-3)
+    for name in ("stiffness", "impact_depth"):
+        expected = [float(getattr(contact.params, name)) for contact in named.contacts]
+        np.testing.assert_allclose(np.asarray(getattr(found, name)), expected, rtol=1e-6)
+    changed = scene.replace_material("a", impact_depth=1e-7).others
+    assert changed is not None
+    at = scene.others.pairs.index((0, 3))
+    assert float(changed.pair_params.impact_depth[at]) == pytest.approx(1e-7)

@@ -48,3 +48,24 @@ def test_what_is_wrong_is_named():
         made.initial_state(ball=dict(origin=(0, 1)))
     with pytest.raises(ValueError, match="'right arm'"):
         made.initial_state({"right arm": {}})
+
+
+def test_spins_in_world_axes():
+    """Turned by 90° about z, the world's y is the body's x."""
+    half = np.sqrt(0.5)
+    ball = dano.Body("ball", dano.Sphere(0.1), mass=1.0)
+    scene = dano.Scene.create([ball], timestep=0.01)
+    turned = dict(orientation=(half, 0, 0, half), spin_world=(0, 3, 0))
+    np.testing.assert_allclose(scene.initial_state(ball=turned)["ball"].omega, (3, 0, 0), atol=1e-12)
+    own = dano.Body("ball", dano.Sphere(0.1), mass=1.0, orientation=(half, 0, 0, half), spin_world=(0, 3, 0))
+    scene = dano.Scene.create([own], timestep=0.01)
+    np.testing.assert_allclose(scene.initial_state()["ball"].omega, (3, 0, 0), atol=1e-12)
+    # What a state says takes the place of what the body says.
+    np.testing.assert_allclose(scene.initial_state(ball=dict(omega=(0, 0, 1)))["ball"].omega, (0, 0, 1))
+    with pytest.raises(ValueError, match=r"omega \(axes of the body\) or by spin_world, got both"):
+        scene.initial_state(ball=dict(omega=(0, 0, 1), spin_world=(0, 0, 1)))
+
+
+def test_words_of_other_programs_get_a_hint():
+    with pytest.raises(ValueError, match=r"got 'friction'; did you mean 'sliding_friction'\?"):
+        dano.ContactParams(friction=0.5)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dano.maths import checked_floating, is_traced, Numbers
+from dano.names import did_you_mean
 
 # A scalar, or None until a scene fills it in; written so that type checkers let users read it from a scene.
 Filled = Float[Array, ""] | Any
@@ -82,14 +83,17 @@ class ContactParams(eqx.Module):
         torsional_drag: Numbers | None = None,
         rolling_friction: Numbers | None = None,
         rolling_drag: Numbers | None = None,
+        **unknown: Any,
     ):
         """See the class.
 
         Raises:
-            ValueError: If a parameter is negative, not finite or not a scalar, `restitution`,
-                `hysteresis` or `friction_fading` exceeds 1, or one that is divided by is zero.
+            ValueError: If there is no such parameter, or one is negative, not finite or not a scalar,
+                `restitution`, `hysteresis` or `friction_fading` exceeds 1, or one that is divided by is zero.
         """
         given = locals()
+        for name, value in unknown.items():
+            checked_parameter(name, value)
         for name in self.__dataclass_fields__:
             value = given[name]
             setattr(self, name, None if value is None else checked_parameter(name, value))
@@ -126,10 +130,9 @@ def checked_parameter(name: str, value: Numbers) -> Float[Array, ""]:
     Raises:
         ValueError: If there is no such parameter, or the value is out of range.
     """
-    if name not in ContactParams.__dataclass_fields__:
-        raise ValueError(
-            f"contact parameter must be one of {list(ContactParams.__dataclass_fields__)}, got {name!r}"
-        )
+    valid = list(ContactParams.__dataclass_fields__)
+    if name not in valid:
+        raise ValueError(f"contact parameter must be one of {valid}, got {name!r}{did_you_mean(name, valid)}")
     array = non_negative(name, value)
     if is_traced(array):
         return array

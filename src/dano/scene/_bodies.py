@@ -1,6 +1,6 @@
 """Bodies: geometry, mass properties, and a name."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -47,7 +47,16 @@ FACES = 256
 LAYER = 0.02
 
 # Quantities of a start, and how many numbers each has; of joints as many as they have coordinates.
-_START = {"position": 3, "origin": 3, "orientation": 4, "velocity": 3, "omega": 3, "q": None, "v": None}
+_START = {
+    "position": 3,
+    "origin": 3,
+    "orientation": 4,
+    "velocity": 3,
+    "omega": 3,
+    "spin_world": 3,
+    "q": None,
+    "v": None,
+}
 _ARGUMENTS = (
     *_START,
     *"mass inertia com mass_scale com_offset material gravcomp fixed weighed".split(),
@@ -136,7 +145,7 @@ class Body(eqx.Module):
                 that nobody knows serves kinematics alone: it is not stepped.
             **start: Where it starts if `Scene.initial_state` is not told otherwise: `position` of the centre
                 of mass, or `origin` of the field frame [m, W], `orientation` (wxyz), `velocity` [m/s, W],
-                `omega` [rad/s, B]; on a joint `q` and `v`.
+                `omega` [rad/s, B] or `spin_world` [rad/s, W]; on a joint `q` and `v`.
 
         Raises:
             ValueError: If the name is empty, the geometry is not a shape or object, a mass property is
@@ -340,9 +349,20 @@ def _checked_start(name: str, start: Mapping[str, Numbers | None]) -> dict[str, 
             shape = np.shape(value) if size is None else (size,)
             check = checked_quaternion(label, value) if size == 4 else checked_array(label, value, shape)
             found[key] = check
-    if "position" in found and "origin" in found:
-        raise ValueError(f"body {name!r} must start by position (centre of mass) or by origin, got both")
+    check_once(f"start of body {name!r}", found)
     return found
+
+
+def check_once(label: str, given: Collection[str]) -> None:
+    """Check that neither the place nor the angular velocity is given in two ways.
+
+    Raises:
+        ValueError: If one is.
+    """
+    if {"position", "origin"} <= set(given):
+        raise ValueError(f"{label} must be given by position (centre of mass) or by origin, got both")
+    if {"omega", "spin_world"} <= set(given):
+        raise ValueError(f"{label} must be given by omega (axes of the body) or by spin_world, got both")
 
 
 @hosted

@@ -14,10 +14,11 @@ from dano.maths import (
     library,
     Numbers,
     Q,
+    quat_conjugate,
     quat_rotate,
     stacked,
 )
-from dano.scene._bodies import Body
+from dano.scene._bodies import Body, check_once
 from dano.scene._joints import Joint, Layout
 from dano.scene._states import JOINT_QUANTITIES, STATE_SIZES
 
@@ -30,8 +31,8 @@ _AT_REST: dict[str, Numbers] = {
     "velocity": (0.0,) * 3,
     "omega": (0.0,) * 3,
 }
-_ORIGIN = "origin"
-"""Where the origin of a body's field frame is, in place of its centre of mass."""
+_INSTEAD = {"origin": "position", "spin_world": "omega"}
+"""In place of a quantity: the origin of the field frame; the angular velocity in world axes."""
 
 
 def merged(what: str, first: ByName | None, named: ByName) -> ByName:
@@ -58,8 +59,9 @@ def started(bodies: Sequence[Body], given: ByName) -> ByName:
             continue
         own = dict(body.start)
         told = _numbers("state", body.name, given)
-        if _ORIGIN in told or "position" in told:
-            own = {key: value for key, value in own.items() if key not in (_ORIGIN, "position")}
+        for pair in _INSTEAD.items():
+            if set(pair) & set(told):
+                own = {key: value for key, value in own.items() if key not in pair}
         found[body.name] = {**own, **told}
     return found
 
@@ -81,18 +83,18 @@ def state_arrays(
             if key not in valid:
                 why = "" if layout.joint_of(i) is None else ", for it hangs on a joint"
                 raise ValueError(f"state of {body.name!r} must be given by {valid}{why}, got {key!r}")
-        if _ORIGIN in numbers and "position" in numbers:
-            raise ValueError(
-                f"state of {body.name!r} must be given by position (centre of mass) or by origin, got both"
-            )
+        check_once(f"state of {body.name!r}", numbers)
         row = {}
         for key, size in STATE_SIZES.items():
             label, value = f"{key} of {body.name!r}", numbers.get(key, _AT_REST[key])
             check = checked_quaternion(label, value) if size == 4 else checked_array(label, value, (3,))
             row[key] = check.astype(dtype)
-        if _ORIGIN in numbers:
-            origin = checked_array(f"origin of {body.name!r}", numbers[_ORIGIN], (3,)).astype(dtype)
+        if "origin" in numbers:
+            origin = checked_array(f"origin of {body.name!r}", numbers["origin"], (3,)).astype(dtype)
             row["position"] = _centre(origin, row["orientation"], body.com, body.com_offset)
+        if "spin_world" in numbers:
+            spin = checked_array(f"spin_world of {body.name!r}", numbers["spin_world"], (3,)).astype(dtype)
+            row["omega"] = _in_body(spin, row["orientation"])
         for key, value in row.items():
             rows[key].append(value)
     return {key: stacked(values) for key, values in rows.items()}
@@ -102,6 +104,12 @@ def state_arrays(
 def _centre(origin: Q, orientation: Q, com: Q, offset: Q) -> Q:
     """Where the centre of mass is of a body whose field frame has an origin [m, W]."""
     return origin + quat_rotate(orientation, (com + offset).astype(origin.dtype))
+
+
+@by_numpy
+def _in_body(spin: Q, orientation: Q) -> Q:
+    """An angular velocity in world axes, in the body's."""
+    return quat_rotate(quat_conjugate(orientation), spin)
 
 
 def control_arrays(
@@ -165,5 +173,5 @@ def _state_keys(layout: Layout, body: int) -> list[str]:
     """What the state of a body is given by."""
     joint = layout.joint_of(body)
     if joint is None:
-        return [*STATE_SIZES, _ORIGIN]
+        return [*STATE_SIZES, *_INSTEAD]
     return list(JOINT_QUANTITIES) if layout.width(joint) else []

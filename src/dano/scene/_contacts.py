@@ -126,11 +126,15 @@ def prepared(
         a, b = by_name[contact.a], by_name[contact.b]
         stiffness = functools.partial(_stiffness, a, b, weight, carried)
         size = min(sizes[a.name], sizes[b.name])
-        sharp = (a.is_plane and b.is_flat) or (b.is_plane and a.is_flat)
-        setting = Setting(size, strength, stiffness, timestep, sharp)
+        setting = Setting(size, strength, stiffness, timestep, is_sharp(a, b))
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
     return tuple(by_name[body.name] for body in bodies), tuple(completed)
+
+
+def is_sharp(a: Body, b: Body) -> bool:
+    """Whether edges and faces of one body, known exactly, meet a plane."""
+    return (a.is_plane and b.is_flat) or (b.is_plane and a.is_flat)
 
 
 def colliders(

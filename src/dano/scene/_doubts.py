@@ -364,5 +364,7 @@ def _begins_inside(
         depth = offset - float(((position[k] + turned) @ normal).min())
         if depth > _DEEP * float(_extents(body).min()):
             text = f"{body.name!r} begins {depth:.3g} m inside {floor.name!r}: it will be pushed out"
+            if body.object is not None:
+                text += " (position is the centre of mass; origin= places the file's own origin)"
             found.append(Doubt(1, f"{text}; {see('a-body-begins-inside-another')}", "start"))
     return found

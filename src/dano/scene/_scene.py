@@ -43,7 +43,7 @@ from dano.scene._making import (
     warn_of_long_steps,
 )
 from dano.scene._motors import Motor
-from dano.scene._others import Others, others_of, unnamed_contacts
+from dano.scene._others import OnPlanes, Others, others_of, unnamed_contacts
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 Parts = TypeVar("Parts", tuple[Joint, ...], tuple[Loop, ...])
@@ -169,6 +169,8 @@ class Scene(eqx.Module):
             f"Scene: {len(self.bodies)} bodies, {len(self.pairs)} pair{'s' * (len(self.pairs) != 1)} that may"
             f" touch{f' ({named})' if named else ''}; step {float(self.timestep):.4g} s"
         )
+        if self.timestep.dtype == np.float32:
+            title += "; in float32: jax_enable_x64 is off"
         return title, rows, ("", "body", "mass", "size")
 
     @property
@@ -313,12 +315,22 @@ class Scene(eqx.Module):
             raise ValueError(
                 f"scene must be created with others=… to have materials, got a change of {name!r}"
             )
+        valid = list(self.others.law.reads)
         for key in changes:
-            if key not in self.others.law.reads:
-                raise ValueError(f"material must be changed in {list(self.others.law.reads)}, got {key!r}")
+            if key not in valid:
+                raise ValueError(
+                    f"material must be changed in {valid}, got {key!r}{did_you_mean(key, valid)}"
+                )
         params = self.others.params
         values = [getattr(params, k).at[i].set(checked_parameter(k, value)) for k, value in changes.items()]
-        return eqx.tree_at(lambda s: [getattr(s.others.params, key) for key in changes], self, values)
+        scene = eqx.tree_at(lambda s: [getattr(s.others.params, key) for key in changes], self, values)
+        of_planes = {
+            key: value for key, value in zip(changes, values, strict=True) if key in OnPlanes._fields
+        }
+        on_planes = self.others.on_planes
+        for key, value in of_planes.items():
+            on_planes = on_planes._replace(**{key: getattr(on_planes, key).at[i].set(value[i])})
+        return eqx.tree_at(lambda s: s.others.on_planes, scene, on_planes)
 
     def replace_body(self, name: str, **changes: Numbers) -> "Scene":
         """The scene with some of a body's `mass, inertia, com, mass_scale, com_offset` changed.
@@ -372,7 +384,8 @@ class Scene(eqx.Module):
         """A state: bodies by keyword, each a dict of `position, orientation, velocity, omega`.
 
         `position` is that of the centre of mass. In its place `origin` is that of the body's field frame, the
-        origin of the file of a mesh or a field. Bodies on joints have `q` and `v` instead: angle [rad] and
+        origin of the file of a mesh or a field. `omega` is in the axes of the body; in its place
+        `spin_world` is in those of the world. Bodies on joints have `q` and `v` instead: angle [rad] and
         rate, or length [m] and rate; three numbers of a ball or a planar joint, see `Joint`. What is not
         given is as `Body(…, position=…)` says; else bodies rest at the origin, or at q = 0. Orientations are
         normalised.

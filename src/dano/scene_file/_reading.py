@@ -59,7 +59,7 @@ from dano.scene_file._table import located, Table
 if TYPE_CHECKING:
     from dano.vision import LearnedField, PosedCamera
 
-_STATE = {**STATE_SIZES, "origin": 3}
+_STATE = {**STATE_SIZES, "origin": 3, "spin_world": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
 _BODY = ("name", *_GEOMETRY, "mass", "mass_scale", "fixed", *_STATE, *JOINT_QUANTITIES)
 _JOINT = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}

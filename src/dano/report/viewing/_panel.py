@@ -10,6 +10,8 @@ import numpy as np
 from dano.report.viewing._drawn import Drawn
 from dano.scene import Scene
 
+# As the panel is, and pages of the documentation are.
+_AS_THE_SYSTEM = '{darkMode:matchMedia("(prefers-color-scheme: dark)").matches}'
 # Points of a graph, which is some hundred pixels wide.
 _POINTS = 400
 # Where cameras stand, from the middle of what moves, in distances of the one that the page opens with.
@@ -48,6 +50,7 @@ def with_panel(page: str, scene: Scene, drawn: Drawn, title: str, frame: float) 
     # What a page reads as the end of a script must not stand in it.
     text = json.dumps(run, ensure_ascii=False).replace("</", "<\\/")
     panel = (files("dano.report.viewing") / "panel.html").read_text(encoding="utf-8")
+    page = page.replace("{darkMode:false}", _AS_THE_SYSTEM, 1)
     page = page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
     before, end, after = page.rpartition("</body>")
     return drawn.opening.in_page(before + panel.replace('"RUN"', text, 1) + end + after)
