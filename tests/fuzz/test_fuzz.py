@@ -27,6 +27,7 @@ NOT_CALLED = {
     "Frames",
     "Identification",
     "InverseKinematics",
+    "Load",
     "Others",
     "Patch",
     "Plan",
