@@ -2,6 +2,7 @@
 
 import ast
 import re
+from collections.abc import Set
 from pathlib import Path
 
 import pytest
@@ -94,3 +95,43 @@ def test_the_map_of_contributing_leads_somewhere():
             path = here if "/" not in place and here.exists() else root / place
             assert path.exists(), row
             folder = path if path.is_dir() else path.parent
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    files = {_name_of(path): path for path in MODULES}
+    waiting = {name: (_imported(path, files.keys()) & files.keys()) - {name} for name, path in files.items()}
+    # Whoever imports none of those that are left is in no circle, and leaves.
+    while free := [name for name, found in waiting.items() if not found & waiting.keys()]:
+        for name in free:
+            del waiting[name]
+    assert not waiting, f"these import each other: {sorted(waiting)}"
+
+
+def _name_of(path: Path) -> str:
+    parts = path.relative_to(SOURCE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _imported(path: Path, names: Set[str]) -> set[str]:
+    """What a module imports, also within functions and by a string, which import-linter does not see.
+
+    What is imported for types alone is not.
+    `from package import module` needs the module, `from package import name` the package.
+    """
+    found, tree = set(), ast.parse(path.read_text(encoding="utf-8"))
+    for_types = [
+        x for x in ast.walk(tree) if isinstance(x, ast.If) and ast.unparse(x.test) == "TYPE_CHECKING"
+    ]
+    skipped = {id(node) for block in for_types for node in ast.walk(block)}
+    for node in ast.walk(tree):
+        if id(node) in skipped:
+            continue
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            each = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {full if full in names else node.module for full in each}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            if node.func.attr == "import_module" and node.args and isinstance(node.args[0], ast.Constant):
+                found.add(str(node.args[0].value))
+    return found

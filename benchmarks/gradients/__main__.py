@@ -1,4 +1,4 @@
-"""`python -m benchmarks.gradients [--json FILE] [--quick] [--only FAMILY ...]`."""
+"""`python -m benchmarks.gradients [--json FILE] [--quick] [--table toss] [--only FAMILY ...]`."""
 
 from benchmarks import _environment
 

@@ -87,13 +87,18 @@ class Family(NamedTuple):
         )
 
 
+def mug() -> dano.AbstractShape:
+    """A cylinder with a handle."""
+    handle = posed(dano.Box((0.015, 0.005, 0.03)), dano.Pose((0.05, 0, 0)))
+    return union(dano.Cylinder(0.04, 0.05), handle)
+
+
 def families(law: dano.AbstractContactLaw) -> dict[str, Family]:
     """All of them."""
-    mug = union(dano.Cylinder(0.04, 0.05), posed(dano.Box((0.015, 0.005, 0.03)), dano.Pose((0.05, 0, 0))))
     return {
         "bunny thrown": _thrown(law, dano.Body("a", build_asset("bunny")), 0.12, 20),
         "soap thrown": _thrown(law, dano.Body("a", build_asset("soap")), 0.1, 15),
-        "mug thrown": _thrown(law, dano.Body("a", mug, mass=0.3), 0.12, 10),
+        "mug thrown": _thrown(law, dano.Body("a", mug(), mass=0.3), 0.12, 10),
         "cube tossed": _thrown(law, dano.Body("a", dano.Box((0.05, 0.05, 0.05)), mass=0.37), 0.15, 15),
         "box on box": _two_bodies(law, 10),
         "pile of five": _pile(law, 10),

@@ -11,6 +11,7 @@ import numpy as np
 
 import dano
 from benchmarks._measure import load_average, parse_arguments, report, Row
+from benchmarks.gradients import _toss
 from benchmarks.gradients._families import CONTACT, families, Family
 from dano.gradients import check
 
@@ -77,6 +78,10 @@ def run() -> None:
     """Measure, print and report."""
     arguments = parse_arguments("Derivatives through impacts over a hundred motions.", _options)
     load, rows = load_average(), []
+    if arguments.table == "toss":
+        settings = {"dtype": "float64", "quick": arguments.quick}
+        report("gradients-toss", _toss.rows(quick=arguments.quick), settings, load, arguments.json)
+        return
     for name, law in (("default law", dano.DistributedLaw()), ("centroid law", dano.CentroidLaw())):
         every = []
         for kind, family in families(law).items():
@@ -95,4 +100,5 @@ def run() -> None:
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--table", choices=("motions", "toss"), default="motions", help="what is measured")
     parser.add_argument("--only", nargs="+", help="some families")

@@ -91,12 +91,16 @@ from dano.engine import (
 from dano.identification import (
     Identification as Identification,
     identify as identify,
+    identify_load as identify_load,
     IdentifyOptions as IdentifyOptions,
+    Load as Load,
     load_motion as load_motion,
+    load_wrist_log as load_wrist_log,
     Motion as Motion,
     motion_of_joints as motion_of_joints,
     Parameter as Parameter,
     save_motion as save_motion,
+    WristLog as WristLog,
 )
 from dano.planning import (
     Actuator as Actuator,
@@ -110,10 +114,16 @@ from dano.planning import (
     SamplingOptions as SamplingOptions,
     Task as Task,
 )
-from dano.scene_file import load_object as load_object, load_scene as load_scene
+from dano.scene_file import (
+    build_parts as build_parts,
+    load_object as load_object,
+    load_scene as load_scene,
+    Part as Part,
+)
 from dano.exchange import export_object as export_object, export_robot as export_robot
 
 from dano.names import keep_old_name as _keep_old_name
+import dano.fields as _fields
 import dano.scene as _scene
 
 __version__ = "0.1.0"
@@ -133,5 +143,7 @@ _scene.offer(
     "film", lambda *given, **options: _importlib.import_module("dano.report").film_run(*given, **options)
 )
 _scene.offer("show", lambda *given: _importlib.import_module("dano.report").show_run(*given))
+# Nor do fields know models of photographs.
+_fields.offer_models(lambda path: _importlib.import_module("dano.vision.radiance").model_of_file(path))
 _keep_old_name("dano.identify", "dano.identification")
 _keep_old_name("dano.plan", "dano.planning")

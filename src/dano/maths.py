@@ -483,6 +483,12 @@ def checked_numbers(name: str, value: Numbers) -> np.ndarray:
     raise ValueError(f"{name} must be a number or an array of real numbers, got {shown(value)}")
 
 
+def _is_text(value: Any) -> bool:
+    """Whether a value is a word, or a list with one: NumPy would read "0.3" as a number."""
+    words = value if isinstance(value, (list, tuple)) else (value,)
+    return any(isinstance(word, (str, bytes)) for word in words)
+
+
 def checked_floating(name: str, value: Numbers) -> Array:
     """`floating` of what a user gave.
 
@@ -491,7 +497,7 @@ def checked_floating(name: str, value: Numbers) -> Array:
     """
     try:
         # NumPy would drop an imaginary part with a warning, and reads no tracers, alone or in a tuple.
-        real = is_traced(value) or not (isinstance(value, bool) or np.iscomplexobj(value))
+        real = is_traced(value) or not (isinstance(value, bool) or _is_text(value) or np.iscomplexobj(value))
         array = floating(value) if real else None
     except (TypeError, ValueError, OverflowError):
         array = None

@@ -104,6 +104,11 @@ def test_one_kind_for_another(run, egg, field, scene, tmp_path):
     answer = run("simulate", missing, "-o", tmp_path / "run.npz")
     assert answer.code == 2 and missing.name in answer.err
     assert list(tmp_path.iterdir()) == [scene]
+    robot = tmp_path / "arm.urdf"
+    robot.write_text('<robot name="r"><link name="a"/></robot>')
+    answer = run("simulate", robot)
+    assert answer.code == 2 and "is a robot's file, not an object: `dano inspect" in answer.err
+    robot.unlink()
     for word in ("simulate", "inspect"):
         answer = run(word, "bunn")
         assert answer.code == 2 and "did you mean 'bunny'?" in answer.err

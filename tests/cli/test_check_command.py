@@ -203,6 +203,8 @@ def test_sizes_and_masses_in_other_units_are_odd(radius, mass, said):
         (("sliding_friction", "friction"), "did you mean 'sliding_friction'"),
         (("n_steps = 40", "n_steps = 40\nduration = 1.0"), "say the same, got 1.0 and 40: keep one"),
         (("n_steps = 40", ""), "needs either duration .s. or n_steps, got neither"),
+        (("n_steps = 40", "[[bodies]]\nn_steps = 40"), "'n_steps' stands within bodies 1: write it above"),
+        (("radius = 0.05", "radius = 0.05\nfriction = 0.3"), "of all pairs in .default_contact."),
         (
             ('shape = "sphere"\nradius = 0.05', 'shape = "box"\nsize = [1, 1, 1]'),
             "did you mean 'half_extents'",

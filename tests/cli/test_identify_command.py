@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dano
-from dano.cli.identifying._run import _errors_text
+from dano.cli.identifying.run import _errors_text
 from dano.identification import Errors
 from dano.identification._problem import Problem
 from dano.solvers import bounded_least_squares

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from dano import archive as archive_module
+from dano.building import BuildOptions
 from dano.fields import GridField, load_field, save_field, SignedDistanceGrid, Sphere
+from dano.scene_file import object_of_file
 
 VALUES = np.random.default_rng(0).random((6, 5, 7))
 
@@ -61,7 +63,8 @@ def test_voxels_are_centred_with_unit_size_unless_told(dtype, tmp_path):
     path = tmp_path / "voxels.npy"
     voxels = (VALUES > 0.5).astype(dtype)
     np.save(path, voxels)
-    loaded = load_grid(path)
+    with pytest.warns(UserWarning, match="no spacing was given"):
+        loaded = load_grid(path)
     np.testing.assert_allclose(loaded.spacing, 1 / 7)
     np.testing.assert_allclose(loaded.origin, -(np.array(VALUES.shape) - 1) / 14)
     np.testing.assert_array_equal(loaded.values, voxels.astype(float))
@@ -261,3 +264,16 @@ def test_all_arrays_of_a_file_count(tmp_path, monkeypatch):
         with pytest.raises(ValueError, match="a6 of shape"):
             for name in arrays.names:
                 assert arrays[name].shape == (1000,)
+
+
+def test_voxels_without_spacing_are_said(tmp_path):
+    """Their longest side is a metre: whoever gives a spacing, or the object's length, is told nothing."""
+    path = tmp_path / "voxels.npy"
+    values = np.zeros((12, 12, 12), bool)
+    values[3:9, 3:9, 3:9] = True
+    np.save(path, values)
+    with pytest.warns(UserWarning, match="the longest side of the grid is taken as 1 m; give spacing"):
+        assert np.ptp(np.asarray(load_field(path).bounds), axis=0).max() == pytest.approx(1, rel=0.2)
+    assert load_field(path, spacing=0.01).bounds is not None
+    options = BuildOptions(samples=200, resolution=24, length=0.1, mass=1.0)
+    assert object_of_file(path, options).size == pytest.approx(0.1, rel=0.02)

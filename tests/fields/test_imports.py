@@ -207,9 +207,9 @@ def test_crop_scale_and_pose(tmp_path):
     outside = pose.apply(jnp.asarray([[0.08, 0.0, 0.0]]))
     assert float(placed.jet(outside.T, 0)[0]) == 0
     with pytest.raises(ValueError, match="a.npy: crop must hold two nodes"):
-        load_field(tmp_path / "a.npy", crop=[(5, 5, 5), (6, 6, 6)])
+        load_field(tmp_path / "a.npy", spacing=0.25, crop=[(5, 5, 5), (6, 6, 6)])
     with pytest.raises(ValueError, match="scale must be finite and > 0, got -1.0"):
-        load_field(tmp_path / "a.npy", scale=-1.0)
+        load_field(tmp_path / "a.npy", spacing=0.25, scale=-1.0)
     save_field(GridField(values, (0, 0, 0), 0.1), tmp_path / "a.npz")
     with pytest.raises(ValueError, match="lower corner below"):
         load_field(tmp_path / "a.npz", crop=[(1, 0, 0), (0, 1, 1)])

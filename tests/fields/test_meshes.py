@@ -231,3 +231,12 @@ def test_solids_of_cad_are_in_metres():
     moments = box.solid_moments()
     np.testing.assert_allclose(moments.volume, 3.5e-4, rtol=1e-6)
     np.testing.assert_allclose(moments.centroid, (0.05, 0.035, 0.025), atol=1e-6)
+
+
+def test_a_file_that_was_cut_off_is_said_to_be(tmp_path):
+    path = tmp_path / "ball.stl"
+    trimesh = pytest.importorskip("trimesh")
+    trimesh.creation.icosphere(3).export(path)
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(ValueError, match="got no whole triangle: is it cut off"):
+        load_field(path)

@@ -10,7 +10,7 @@ from dano.identification import Errors
 from dano.identification._identify import _missed
 from dano.identification._scales import check_scales
 from dano.identification._uncertainty import _width
-from dano.maths import quat_exp, quat_rotate
+from dano.maths import quat_exp, quat_multiply, quat_rotate
 
 SCENE = dano.Scene.create([dano.Body("ball", dano.Sphere(0.05), mass=1.0)], timestep=0.005)
 
@@ -69,6 +69,58 @@ def test_bodies_beside_the_plane_that_carries_them_are_said(height, text, tilt):
             times, ("box",), position=falling + 0.05, orientation=np.tile(turn, (12, 1))
         )
         check_scales(scene, [thrown], None, state)
+
+
+def slid(n: int = 30, roll: float = 0.0, height: float = 0.02) -> dano.Motion:
+    """A box of three heights that slides, and turns a little, on the floor; on its side if it is rolled."""
+    times = np.arange(n) / 30
+    position = np.stack([0.3 * times, 0.1 * times, height + 0 * times], axis=1)
+    turns = quat_exp(np.stack([0 * times, 0 * times, 0.4 * times], axis=1))
+    turns = np.asarray(quat_multiply(turns, np.array([np.cos(roll / 2), np.sin(roll / 2), 0, 0])))
+    return dano.Motion.create(times, ("box",), position=position, orientation=turns)
+
+
+FRAMES = {
+    "with y as the axis that is up": (np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0]), 0),
+    "upside down": (np.array([0.0, 1, 0, 0]), 0),
+    "with quaternions read as xyzw": (np.array([1.0, 0, 0, 0]), -1),
+}
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_motions_in_another_frame_are_said_with_the_turn_that_fits(name: str):
+    """Each is the motion above, turned into the frame that the words are about."""
+    box = dano.Body("box", dano.Box((0.05, 0.04, 0.02)), mass=1.0)
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+    scene = dano.Scene.create([box, floor], timestep=0.005)
+    motion, (turn, roll) = slid(roll=np.pi / 2, height=0.04), FRAMES[name]
+    turns = np.roll(np.asarray(quat_multiply(turn, motion.orientation[:, 0])), roll, axis=-1)
+    places = np.asarray(quat_rotate(turn, motion.position[:, 0]))
+    other = dano.Motion.create(motion.times, ("box",), position=places, orientation=turns)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert check_scales(scene, [motion], None)
+    with pytest.warns(UserWarning, match=f"but does {name}.*: is the motion in another frame"):
+        assert not check_scales(scene, [other], None)
+
+
+def test_a_fit_in_another_frame_does_not_search_long():
+    """Y is up: the misfit is said, after tens of evaluations and not after a thousand."""
+    box = dano.Body("box", dano.Box((0.05, 0.04, 0.02)), mass=0.5)
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+    friction = dano.ContactParams(sliding_friction=0.5)
+    scene = dano.Scene.create([box, floor], [dano.Contact("box", "floor", friction)], timestep=0.01)
+    motion, turn = slid(12), FRAMES["with y as the axis that is up"][0]
+    turns = quat_multiply(turn, motion.orientation[:, 0])
+    places = np.asarray(quat_rotate(turn, motion.position[:, 0]))
+    other = dano.Motion.create(motion.times, ("box",), position=places, orientation=np.asarray(turns))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        fit = dano.identify(scene, other, ["box,floor.sliding_friction:0:1"], initial="states")
+    texts = [str(each.message) for each in said]
+    assert any("is the motion in another frame" in text for text in texts)
+    assert any("the fit misses the observed positions" in text for text in texts)
+    assert fit.evaluations < 100
 
 
 def test_what_cannot_be_is_refused():

@@ -44,9 +44,9 @@ def cache(made, tmp_path, monkeypatch) -> Iterator[Path]:
     shutil.copytree(made, folder)
     monkeypatch.setenv("DANO_CACHE_DIR", str(folder))
     monkeypatch.setattr(_objects, "SHIPPED", tmp_path / "nothing")
-    _objects._loaded.cache_clear()
+    _objects._loaded.clear()
     yield folder
-    _objects._loaded.cache_clear()
+    _objects._loaded.clear()
 
 
 @pytest.fixture

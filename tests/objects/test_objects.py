@@ -1,5 +1,7 @@
 """From a field to an object: samples, thresholds, mass models, floaters and hollow cores, files."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -147,6 +149,32 @@ def test_save_and_load(solid_ball, tmp_path):
     np.testing.assert_array_equal(loaded.samples.points, solid_ball.samples.points)
     assert loaded.mass_model == solid_ball.mass_model
     assert [p.name for p in tmp_path.iterdir()] == ["ball.dano"]
+
+
+def test_a_centre_of_mass_far_beside_the_samples_is_refused():
+    """Where a body's samples lie, there is its mass; samples of one side alone may be beside it."""
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
+    known: dict[str, Any] = dict(points=points, density=np.ones(50), mass=1.0, inertia=1e-3 * np.eye(3))
+    assert dano.NeuralObject.from_samples(com=(0.0, 0.0, 0.2), **known).mass.com[2] == 0.2
+    with pytest.raises(ValueError, match="com must lie within the body .*, 9.9 m beside points that span"):
+        dano.NeuralObject.from_samples(com=(10.0, 0.0, 0.0), **known)
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_a_distance_in_place_of_a_density_is_said(signed: bool):
+    """As max(d, 0), and as |d|: both make an object of what lies around a ball."""
+    axis = np.linspace(-0.2, 0.2, 24)
+    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    distance = np.linalg.norm(places, axis=-1) - 0.1
+    values = np.abs(distance) if signed else np.maximum(distance, 0)
+    made: dict[str, Any] = dict(n_samples=200, resolution=24)
+    with pytest.warns(UserWarning, match="grows evenly to the border .* as a distance does"):
+        dano.NeuralObject.from_field(dano.GridField(values, axis[[0, 0, 0]], axis[1] - axis[0]), **made)
+    # Neither a ball nor a box's walls, which are dense where their grid ends, grow evenly.
+    walls = (np.abs(places).max(axis=-1) > 0.17).astype(float)
+    for density in ((distance < 0).astype(float), np.exp(-np.maximum(distance, 0) / 0.02), walls):
+        grid = dano.GridField(density, axis[[0, 0, 0]], axis[1] - axis[0])
+        assert float(dano.NeuralObject.from_field(grid, **made).mass.mass) > 0
 
 
 def test_from_samples_keeps_what_is_given():

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from reference_step.distances import signed_distance
-from reference_step.law import FACTOR, Law, laws_of, smooth_step
+from reference_step.law import Law, laws_of, smooth_step
 from reference_step.rotations import cross_matrix
 
 import dano
@@ -480,7 +480,7 @@ def impact(bodies, side, arm, normal, load, near_load, approach):
     for k, lever in ((side.i, r), (side.j, r + bodies.position[side.i] - bodies.position[side.j])):
         turning = np.cross(lever, n)
         mobility += turning @ bodies.inverse_inertia[k] @ turning
-    factor = beta * FACTOR / (1 + (1 - beta) * FACTOR)
+    factor = beta * side.law.F / (1 + (1 - beta) * side.law.F)
     return beta, factor / (bodies.h * mobility * load.sum())
 
 

@@ -61,6 +61,7 @@ def traction(material: dict[str, float], points, rate, slip):
     rows["sunk"] = points.sunk
     of_impact = np.zeros(n, point_law.Impact.numpy_dtype())
     of_impact["share"], of_impact["stiffness"], of_impact["depth"] = points.beta, points.kappa, points.delta
+    of_impact["factor"] = points.law.F
     of_impact["deepest"], of_impact["part"], of_impact["way"] = points.deepest, 1.0, points.way
     of_impact["delays"], of_impact["rest"] = points.delays, material["timestep"]
     of_impact["rest"] *= 1 - points.delays * points.share

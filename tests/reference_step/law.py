@@ -5,9 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from reference_step.rotations import cross_matrix
 
-FACTOR = 100.0
-"""Momentum that an impact passes on over that of the common mass, for each speed that is missing."""
-
 
 class Law(NamedTuple):
     """Parameters of a pair of bodies: symbols of docs/theory/contact.md.
@@ -25,6 +22,7 @@ class Law(NamedTuple):
         compliant: Whether impacts are left to the spring.
         h: Timestep [s].
         delta: Depth of an impact [m].
+        F: Momentum that an impact passes on over that of the common mass, for each speed that is missing.
         slowest_rebound: v_e + g h or √(g δ), whichever is larger [m/s].
         gravity: g for samples that are deep [m/s²].
     """
@@ -41,6 +39,7 @@ class Law(NamedTuple):
     compliant: bool
     h: float
     delta: float
+    F: float
     slowest_rebound: float
     gravity: float
 
@@ -64,12 +63,14 @@ def laws_of(scene):
     if scene.others is not None:
         groups.append((scene.others.law, scene.others.pair_params, len(scene.others.pairs)))
     found = []
+    sizes = [min(float(scene.bodies[k].extent[4]) for k in pair) for pair in scene.point_pairs]
     for law, params, count in groups:
         columns = [np.broadcast_to(getattr(params, name), count) for name in PARAMETERS]
         for numbers in np.array(columns).T:
             k, e, v_e, delta, sigma, mu, phi, p_0 = (float(x) for x in numbers)
             rest = float(law.stiction_velocity), float(law.implicitness), law.compliant
-            rest = *rest, h, delta, max(v_e + g * h, (g * delta) ** 0.5), g if g > 0 else 9.81
+            F = np.clip(sizes[len(found)] / (2 * delta), 100.0, 1e4)
+            rest = *rest, h, delta, F, max(v_e + g * h, (g * delta) ** 0.5), g if g > 0 else 9.81
             found.append(Law(k, e, v_e, sigma, mu, phi, p_0, *rest))
     return found
 
@@ -158,7 +159,7 @@ def goals(law, points):
     rebound = -law.e * points.meets
     fast = smooth_step(2 * rebound / law.slowest_rebound - 1)
     after = fast * (rebound + points.gains) + (1 - fast) * points.way * np.minimum(approach, 0)
-    return after + np.maximum(after - approach, 0) / FACTOR
+    return after + np.maximum(after - approach, 0) / law.F
 
 
 def smooth_step(x):

@@ -7,7 +7,7 @@ from reference_step.law import Law, pressure, traction, wrench
 
 HARD = Law(
     k=2e6, e=0.4, v_e=0.05, sigma=0.2, mu=0.5, phi=0.3, p_0=2e3, v_s=1e-7, theta=1.0, compliant=False, h=0.01,
-    delta=1e-3, slowest_rebound=0.15, gravity=9.81,
+    delta=1e-3, F=100.0, slowest_rebound=0.15, gravity=9.81,
 )  # fmt: skip
 LAWS = {
     "default": HARD,

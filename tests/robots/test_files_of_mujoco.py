@@ -116,6 +116,9 @@ def test_key_frames_are_states_of_mujoco(framed):
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(name).id, speed, 0)
         # Of the centre of mass, in axes of the world.
         np.testing.assert_allclose(frames.velocity[i], speed[3:], atol=1e-9)
+    # Its place may be told by its origin, too, in place of the file's.
+    moved = robot.state(scene, **{"my a": dict(origin=(1.0, 2.0, 3.0))})
+    np.testing.assert_allclose(robot.place(scene, moved, "a")[0], (1, 2, 3), atol=1e-12)
     with pytest.raises(ValueError, match=r"key frame must be one of \['up', 'key 1'\], got 'upp'"):
         robot.state(scene, "upp")
 

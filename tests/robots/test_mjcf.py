@@ -215,16 +215,16 @@ LACKING = {
         '<option density="1000" viscosity=".1"/>',
         "<option> has density 1000 kg/m³ and viscosity 0.1 Pa s",
     ),
-    "tendons": (HINGE, TENDON.format(' stiffness="1"'), "'t': dano has no tendons"),
+    "tendons": (
+        EQUAL,
+        '<tendon><fixed name="t" stiffness="1"><joint joint="a" coef="1"/><joint joint="b" coef="2"/></fixed>'
+        "</tendon>",
+        "'t': of tendons dano has only fixed ones",
+    ),
     "ball limits": (
         body("a", '<joint name="a" type="ball" range="0 1" limited="true"/>'),
         "",
         "the ball joint 'a' has a range",
-    ),
-    "free joints": (
-        body("a", '<joint name="a" type="free" damping="1"/>'),
-        "",
-        "the free joint 'a' has damping",
     ),
     "equalities": (
         EQUAL,

@@ -209,3 +209,39 @@ def test_starts_beyond_limits_and_efforts_are_said(tmp_path):
     assert scene.joint("arm").child == "arm"
     with pytest.raises(ValueError, match="body must be one of"):
         scene.joint("base")
+
+
+def test_robots_without_mass_serve_kinematics(tmp_path):
+    """Two links of 0.3 m, of which nobody knows what they weigh."""
+    path = tmp_path / "bare.urdf"
+    path.write_text(
+        '<robot name="bare"><link name="base"/><link name="upper"/><link name="lower"/><link name="tip"/>'
+        '<joint name="a" type="continuous"><parent link="base"/><child link="upper"/>'
+        '<axis xyz="0 1 0"/></joint>'
+        '<joint name="b" type="continuous"><parent link="upper"/><child link="lower"/>'
+        '<origin xyz="0.3 0 0"/><axis xyz="0 1 0"/></joint>'
+        '<joint name="c" type="fixed"><parent link="lower"/><child link="tip"/>'
+        '<origin xyz="0.3 0 0"/></joint>'
+        "</robot>"
+    )
+    with pytest.raises(ValueError, match=r"kinematics alone needs no mass, with ignore=\['masses'\]"):
+        dano.load_urdf(path)
+    robot = dano.load_urdf(path, ignore="masses")
+    scene = robot.scene()
+    state = robot.state(scene, dict(a=0.3, b=-1.0))
+    expected = 0.3 * np.array([np.cos(0.3) + np.cos(0.7), 0, np.sin(0.7) - np.sin(0.3)])
+    np.testing.assert_allclose(robot.place(scene, state, "tip")[0], expected, atol=1e-12)
+    target = dano.Target("tip", position=(0.4, 0.0, 0.1))
+    found = dano.inverse_kinematics(robot, scene, state, [target])
+    assert found.reached
+    calls = [
+        lambda: dano.simulate(scene, state, 2),
+        lambda: dano.step(scene, state),
+        lambda: dano.mass_matrix(scene, state),
+        lambda: dano.bias_forces(scene, state),
+        lambda: dano.gravity_forces(scene, state),
+        lambda: dano.export_robot(robot, tmp_path / "again.urdf", scene=scene),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match="bodies of known mass, got none for 'upper', 'lower'"):
+            call()

@@ -41,6 +41,13 @@ ODD = {
     "a sheet": (toml(half="[0.045, 0.03, 1e-6]", mass=1e-5), "too thin for its samples"),
     "shorter than a step": (toml(top="timestep = 0.005\nduration = 0.001"), "0.005 s are run"),
     "rounded": (toml(top="timestep = 0.01\nduration = 0.0333"), "0.03 s are run"),
+    "a joint's angle in degrees": (toml(body="q = 90", more=HINGE), "q of 'box' is 90 rad, 14.3 turns"),
+    "a force in millinewtons": (
+        toml(more=LATE.replace("[1, 0, 0]\nfrom = 2.0", "[3e4, 0, 0]")),
+        "in newtons?",
+    ),
+    "far away": (toml(body="position = [0, 0, 1e13]"), "where numbers are 0.002 m apart: is its position"),
+    "a timestep in nanoseconds": (toml(top="timestep = 5e-9\nn_steps = 60"), "a second takes 2e+08 steps"),
     "controls too late": (toml(more=LATE), "1 never acts: it begins at 2 s, and 0.3 s are run"),
     "nothing touches": (toml(top=TOP + "\ncontacts = []"), "touches nothing"),
     "an angle of friction": (toml(more="[default_contact]\nsliding_friction = 30"), "not an angle"),
@@ -103,6 +110,34 @@ def test_python_says_it_when_it_is_made():
         scene.initial_state(soap=dict(velocity=(1200, 0, 0)))
 
 
+def test_a_centre_of_mass_of_another_frame_is_said():
+    for com, said in (((0.02, 0, 0), 0), ((1.0, 0, 0), 1)):
+        body = dano.Body("ball", dano.Sphere(0.1), mass=1.0, com=com)
+        found = said_of(lambda body=body: dano.Scene.create([body]))
+        assert ["the centre of mass of 'ball' lies 0.899 m beside" in text for text in found] == [True] * said
+
+
+def test_an_edge_through_the_whole_shape_is_said():
+    for edge, said in ((0.05, 0), (0.5, 1)):
+        ball = dano.Body("ball", dano.Sphere(0.1, edge=edge), mass=1.0)
+        found = said_of(lambda ball=ball: dano.Scene.create([ball]))
+        assert ["0.5 m wide and its shape 0.2 m thick: it has no inside" in text for text in found] == [
+            True
+        ] * said
+
+
+def test_words_are_no_numbers_and_states_no_state():
+    """NumPy reads "0.3" as a number; a state with a leading axis is many."""
+    for word in ("0.3", ["0.3"]):
+        with pytest.raises(ValueError, match="sliding_friction must be a number or an array"):
+            dano.ContactParams(sliding_friction=word)
+    scene = dano.Scene.create([dano.Body("ball", dano.Sphere(0.1), mass=1.0)])
+    states = jax.tree.map(lambda x: np.stack([x, x]), scene.initial_state())
+    for call in (lambda: dano.simulate(scene, states, 2), lambda: dano.step(scene, states)):
+        with pytest.raises(ValueError, match=r"one state, with positions of shape \(1, 3\), got \(2, 1, 3\)"):
+            call()
+
+
 def test_traced_numbers_are_not_judged():
     soap = dano.Body("soap", dano.Box((0.045, 0.03, 0.02)), mass=0.15)
 
@@ -118,6 +153,11 @@ def test_links_with_a_mark_are_not_judged_by_it():
     link = dano.Body("link", dano.Sphere(0.01), mass=5.0, com=(0, 0, 0.2), inertia=0.1 * np.eye(3))
     joint = dano.Joint(None, "link", anchor=(0, 0, 0.5))
     assert said_of(lambda: dano.Scene.create([link], joints=[joint])) == []
+    # Heavy and small, or there only to carry others.
+    for mass in (0.3, 1e-11):
+        point = dano.Body("link", dano.Sphere(0.01), mass=mass)
+        assert said_of(lambda point=point: dano.Scene.create([point], joints=[joint])) == []
+        assert said_of(lambda point=point: dano.Scene.create([point]))
 
 
 def test_an_axis_and_an_angle_are_no_quaternion():

@@ -5,6 +5,7 @@ The authors' file holds them in the axes of the table, which is level there but 
 that a straight path cannot show.
 """
 
+import argparse
 import time
 import warnings
 from collections.abc import Callable
@@ -30,19 +31,40 @@ OTHER_RATIO = (80 / 280) / (56 / 144)
 
 def run() -> None:
     """Measure, print and report."""
-    arguments = parse_arguments("Identify the friction of the filmed soap.")
+    arguments = parse_arguments("Identify the friction of the filmed soap.", _options)
     load = load_average()
     folder = reference_folder()
     if folder is None:
         rows, values = [skipped(REAL, "all of them", NO_DATA)], {}
     else:
-        rows, values = _real(folder)
+        rows, values = _real(folder, arguments.picture)
         rows += _scaled(folder, starts=2 if arguments.quick else 8)
     settings: dict[str, object] = {"dtype": "float64", "quick": arguments.quick}
     report("paper.soap", rows, settings, load, arguments.json, values=values)
 
 
-def _real(folder: Path) -> tuple[list[Row], dict[str, float]]:
+def _options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--picture", type=Path, metavar="FILE", help="also draw the slide, filmed and simulated"
+    )
+
+
+def _draw(path: Path, fit: dano.Identification) -> None:
+    """Way of the soap over time: positions of the film, and the simulation with the friction found."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.0, 2.6), layout="constrained")
+    axis = figure.subplots()
+    for motion, style, label in ((fit.motions[0], ".", "filmed"), (fit.fitted[0], "-", "dano")):
+        way = np.linalg.norm(motion.position[:, 0] - fit.motions[0].position[0, 0], axis=1)
+        axis.plot(1e3 * motion.times, 1e3 * way, style, label=label)
+    axis.set(xlabel="time [ms]", ylabel="way [mm]")
+    axis.legend(frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def _real(folder: Path, picture: Path | None = None) -> tuple[list[Row], dict[str, float]]:
     data = np.load(folder / "soap_real_pose_traj.npz")
     path, axes = _path_on_table(data)
     times = np.arange(len(path)) * float(data["dt_video"])
@@ -53,6 +75,8 @@ def _real(folder: Path) -> tuple[list[Row], dict[str, float]]:
         "friction", lambda s: s.contact("soap", "table").sliding_friction, 0.0, 1.0, start=0.0
     )
     fit, seconds = _twice(lambda: dano.identify(scene, motion, [friction], state=begin, initial=["velocity"]))
+    if picture is not None:
+        _draw(picture, fit)
     deceleration, error = _deceleration(times, path)
     values = {
         "friction": fit.values["friction"],

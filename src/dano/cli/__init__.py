@@ -61,6 +61,7 @@ def _run(argv: list[str], keep: bool) -> None:
     command = parse(argv)
     import jax
 
+    from dano.cli._commands import run
     from dano.cli._console import say
     from dano.cli._outputs import named
     from dano.programs import keep_programs
@@ -75,7 +76,7 @@ def _run(argv: list[str], keep: bool) -> None:
             # Not when the process ends, which it may do at once.
             end.callback(keep_programs())
         command, line = named(command)
-        command()
+        run(command)
         if line is not None:
             say(line)
 

@@ -60,12 +60,6 @@ class Train:
     json: Path | None = None
     previews: Path | None = None
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _learn
-
-        _learn.train(self)
-
 
 @dataclass(frozen=True)
 class Poses:
@@ -127,12 +121,6 @@ class Poses:
     seed: int = 0
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _learn
-
-        _learn.poses(self)
-
 
 @dataclass(frozen=True)
 class Data:
@@ -156,12 +144,6 @@ class Data:
     table: float | None = None
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _learn
-
-        _learn.data(self)
-
 
 @dataclass(frozen=True)
 class Build:
@@ -169,22 +151,19 @@ class Build:
 
     Attributes:
         field: Density grid (.npz with values, origin, spacing), voxels (.npy), mesh (.obj, .stl, …), object
-            (.dano), a shipped one (bunny, soap, …), or what `dano import` reads.
+            (.dano), a shipped one (bunny, soap, …), or what `dano import` reads. Or a part of one object: a
+            mesh with its density [kg/m³] or mass, as blade.ply:7850 or grip.ply:0.3kg.
+        further: Its other parts, in the same frame and units.
         output: Where to write the object, usually *.dano.
         options: How to make it.
         json: Print one JSON object instead of text.
     """
 
     field: Positional[Path]
+    further: Positional[tuple[Path, ...]] = ()
     output: Output = UNNAMED
     options: Annotated[BuildOptions, arg(name="")] = BuildOptions()
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _objects
-
-        _objects.build(self)
 
 
 @dataclass(frozen=True)
@@ -251,12 +230,6 @@ class Import:
     keep_transform: bool = False
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _import
-
-        _import.import_field(self)
-
 
 @dataclass(frozen=True)
 class Inspect:
@@ -274,12 +247,6 @@ class Inspect:
     png: Path | None = None
     no_png: bool = False
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _objects
-
-        _objects.inspect(self)
 
 
 @dataclass(frozen=True)
@@ -318,12 +285,6 @@ class Simulate:
     resume: bool = False
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _scenes
-
-        _scenes.simulate(self)
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -351,12 +312,6 @@ class Plan:
     slow_motion: float = 1.0
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import planning
-
-        planning.plan(self)
-
 
 @dataclass(frozen=True)
 class View:
@@ -376,12 +331,6 @@ class View:
     beside: Path | None = None
     page: Path | None = None
     port: int = 8080
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _scenes
-
-        _scenes.view(self)
 
 
 @dataclass(frozen=True)
@@ -419,12 +368,6 @@ class Export:
     texture_size: int = 1024
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _export
-
-        _export.export(self)
-
 
 @dataclass(frozen=True)
 class Compare:
@@ -456,12 +399,6 @@ class Compare:
     seed: int = 0
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _compare
-
-        _compare.compare(self)
-
 
 @dataclass(frozen=True)
 class Cache:
@@ -482,12 +419,6 @@ class Cache:
     limit: str | None = None
     json: bool = False
 
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _cache
-
-        _cache.cache(self)
-
 
 @dataclass(frozen=True)
 class Demo:
@@ -505,9 +436,3 @@ class Demo:
     output: Output = Path("dano-demo")
     draft: bool = False
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli import _scenes
-
-        _scenes.demo(self)

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import textwrap
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_output, missing_for_pictures
 from dano.objects import Interior, NeuralObject
 from dano.robots import read_robot, robot_doubts, robot_tree
-from dano.scene_file import load_object, object_of_file
+from dano.scene_file import build_parts, load_object, materials_doubt, object_of_file, parts_of
 
 # Names of files that hold robots end so.
 _ROBOTS = (".urdf", ".xml", ".mjcf")
@@ -25,10 +26,18 @@ def build(command: Build) -> None:
     if options.mass is not None and options.mass_scale is not None:
         # Before a large field is read.
         raise ValueError(f"give either --mass or --mass-scale, got {options.mass} and {options.mass_scale}")
-    check_output(output, command.field)
+    sources = (command.field, *command.further)
+    parts = parts_of(sources)
+    for source in [Path(part.name) for part in parts] or sources:
+        check_output(output, source)
     progress = Progress()
     progress("reading the field", 0.0)
-    made = object_of_file(command.field, options, dashes="--", progress=progress)
+    if parts:
+        made = build_parts(parts, options, dashes="--", progress=progress)
+    else:
+        made = object_of_file(command.field, options, dashes="--", progress=progress)
+        if made.mass_model != "given" and (doubt := materials_doubt(command.field)):
+            warnings.warn(doubt, stacklevel=2)
     progress.close()
     made.save(output)
     report = describe(made, output)

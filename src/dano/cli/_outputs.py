@@ -1,7 +1,7 @@
 """Checks before any work starts: where results go, and whether what draws them is installed."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ _NAMED_AFTER: dict[type, tuple[str, str]] = {
 """Commands with the input that their output is named after, and what is appended to its name."""
 
 
-def named(command: Callable[[], None]) -> tuple[Callable[[], None], str | None]:
+def named(command: Any) -> tuple[Any, str | None]:
     """The command with a name for its output, and a line that says it once it is there, if nobody gave one.
 
     Outputs go to the current folder under the input's name; cameras go to their photographs, where
@@ -87,7 +87,9 @@ def free_path(path: Path, *, taken: Sequence[Path] = (), keep: bool = True) -> P
 
 def _stem(source: Path | str) -> str:
     """Name of an input without its folder and endings; of a function package.module:name its name."""
-    path = Path(str(source).rpartition(":")[2])
+    head, _, tail = str(source).rpartition(":")
+    # Behind a part of an object stands what it weighs, blade.ply:7850.
+    path = Path(head if head and tail[:1].isdigit() else tail)
     if path.name in ("transforms.json", "anno_train.json"):
         path = path.parent
     return path.absolute().name.split(".", 1)[0] or "dano"

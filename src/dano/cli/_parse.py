@@ -6,8 +6,8 @@ import inspect
 import io
 import re
 import textwrap
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import tyro
 from tyro.conf import FlagCreatePairsOff
@@ -76,7 +76,7 @@ _COMMANDS = {name: row for group in GROUPS.values() for name, row in group.items
 _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 
 
-def parse(argv: Sequence[str]) -> Callable[[], None]:
+def parse(argv: Sequence[str]) -> Any:
     """The command that the arguments ask for, ready to be called.
 
     Exits with code 0 after printing help.

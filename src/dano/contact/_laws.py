@@ -156,11 +156,15 @@ class Setting(NamedTuple):
         gravity: Its magnitude, 9.81 where there is none [m/s²].
         stiffness: Gives the stiffness [Pa/m] at which either body, set down on a rigid floor in a typical
             orientation, sinks by at most a share of its size.
+        timestep: h [s].
+        sharp: Whether a body whose edges and faces are known exactly meets a plane.
     """
 
     size: float
     gravity: Float[Array, ""]
     stiffness: Callable[[float], Float[Array, ""]]
+    timestep: Float[Array, ""]
+    sharp: bool
 
 
 class AbstractContactLaw(eqx.Module):

@@ -133,13 +133,28 @@ class VariationalEngine(AbstractEngine):
         return _touching.wrenches(scene, prepared.tables, prepared.capacity, before, after, about)
 
 
+def _check_one(scene: Scene, state: State) -> None:
+    """`check_state` of what must be one state.
+
+    Raises:
+        ValueError: As there, or if there are several.
+    """
+    check_state(scene, state)
+    if state.position.ndim != 2:
+        raise ValueError(
+            f"state must be one state, with positions of shape {(len(scene.bodies), 3)}, got"
+            f" {state.position.shape}: dano.rollouts simulates many, and jax.vmap does"
+        )
+
+
 def check_state(scene: Scene, state: State) -> None:
     """`Scene.check_state`, after the scene itself; and whether loops are closed.
 
     Raises:
-        ValueError: If the scene is not a `Scene`, the state does not fit it, or loops are open.
+        ValueError: If the scene is not a `Scene`, a mass is not known, the state does not fit it, or loops
+            are open.
     """
-    checked_kind("scene", scene, Scene)
+    checked_kind("scene", scene, Scene).check_weighed()
     scene.check_state(state)
     closing = scene.closing
     if closing is not None and state.position.ndim == 2 and not is_traced(state, scene):
@@ -179,7 +194,7 @@ def step(
     Raises:
         ValueError: If the state or control does not fit the scene.
     """
-    check_state(scene, state)
+    _check_one(scene, state)
     check_control(scene, control, ())
     following, report = _with_room(engine, scene, lambda engine: _jitted_step(engine, scene, state, control))
     _say(scene, following, report)
@@ -225,7 +240,7 @@ def simulate(
     """
     checked_kind("scene", scene, Scene)
     state = scene.initial_state() if state is None else state
-    check_state(scene, state)
+    _check_one(scene, state)
     n_steps = n_steps if duration is None else _steps(n_steps, duration, scene.timestep)
     controls, n_steps = spread(scene, controls, n_steps)
     if checkpoint_every is not None:
@@ -286,7 +301,7 @@ def linearize(
     Raises:
         ValueError: If the state or control does not fit the scene.
     """
-    check_state(scene, state)
+    _check_one(scene, state)
     check_control(scene, control, ())
     return _jitted_linearize(checked_engine(engine), scene, state, control)
 

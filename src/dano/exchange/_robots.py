@@ -59,6 +59,7 @@ def export_robot(robot: Robot, path: str | os.PathLike[str], *, scene: Scene | N
 
 def _with_values(robot: Robot, scene: Scene) -> Description:
     """What the file says, with the numbers of a scene."""
+    scene.check_weighed()
     missing = [body.name for body in robot.bodies if body.name not in scene.names]
     if missing:
         raise ValueError(

@@ -219,7 +219,7 @@ def checked_values(values: Numbers, name: str = "values") -> Array:
     if np.min(host) < 0:
         raise ValueError(
             f"{name} must be densities ≥ 0, got a least value of {np.min(host)}"
-            " (a signed distance is not a density: use SignedDistanceGrid)"
+            " (a signed distance is not a density: use dano.fields.SignedDistanceGrid)"
         )
     if not np.any(host):
         raise ValueError(

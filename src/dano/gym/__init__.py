@@ -6,6 +6,7 @@ from dano.gym._making import (
     make_env_of_files as make_env_of_files,
     make_vector_env as make_vector_env,
     make_vector_env_of_files as make_vector_env_of_files,
+    stable_baselines_env as stable_baselines_env,
 )
 from dano.gym._rules import Rules as Rules, Start as Start
 

@@ -153,6 +153,12 @@ class SceneVectorEnv(gymnasium.vector.VectorEnv):
         }
         return seen, rewards, met, over, info
 
+    def begun(self, rows: np.ndarray) -> np.ndarray:
+        """Begin episodes anew at once, where `rows` says so; observations of all."""
+        self._begin(rows)
+        self._steps, self._ended = np.where(rows, 0, self._steps), self._ended & ~rows
+        return self.rules.observed(self.states, self._steps)
+
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Pictures of all states, one after the other."""
         if self.render_mode is None:

@@ -120,6 +120,28 @@ def make_vector_env(
     return SceneVectorEnv(rules, state, n_envs, start, rendering)
 
 
+def stable_baselines_env(env: Any) -> Any:
+    """Many episodes for stable-baselines3: a `VecEnv` whose steps are one launch of the engine.
+
+    `PPO("MlpPolicy", stable_baselines_env(make_vector_env(…, n_envs=64)))` learns with it. Episodes that end
+    begin anew in the same step, as stable-baselines3 has it: `terminal_observation` in their `info` is what
+    was seen at the end, and `TimeLimit.truncated` says whether the task's steps were over, or one could not
+    be solved.
+
+    Args:
+        env: What `make_vector_env` made. It is stepped by the result alone.
+
+    Raises:
+        ImportError: Without stable-baselines3 (extra `sb3`).
+        ValueError: If it is something else.
+    """
+    optional("stable_baselines3.common.vec_env", "the environment needs stable-baselines3", "sb3")
+    from dano.gym._environments import SceneVectorEnv
+    from dano.gym._stable_baselines import StableBaselinesEnv
+
+    return StableBaselinesEnv(checked_kind("env", env, SceneVectorEnv))
+
+
 def make_env_of_files(scene: str | os.PathLike[str], task: str | os.PathLike[str], **options: Any) -> Any:
     """What `gymnasium.make("dano/Scene-v0", scene=…, task=…)` makes: `make_env` from two files.
 

@@ -10,3 +10,9 @@ from dano.identification.motions import (
     motion_of_joints as motion_of_joints,
     save_motion as save_motion,
 )
+from dano.identification.wrench import (
+    identify_load as identify_load,
+    Load as Load,
+    load_wrist_log as load_wrist_log,
+    WristLog as WristLog,
+)

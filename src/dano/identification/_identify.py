@@ -97,8 +97,10 @@ def identify(
     if options.gaps and len(chosen) < len(QUANTITIES):
         raise ValueError(f"options.continuity needs initial='states', got initial {list(chosen)}")
     sigmas = deviations(scene, motions, noise)
+    if not check_scales(scene, motions, options.window, state if isinstance(state, State) else None):
+        # In another frame nothing fits: a long search for the trend of the loss is in vain.
+        options = dataclasses.replace(options, smooth=False)
     setup = Setup(space, scene, controls, chosen, sigmas, options, checked_engine(engine))
-    check_scales(scene, motions, options.window, state if isinstance(state, State) else None)
     kept = _kept(setup, motions, state, after)
     beside = _motions("held_out", held_out, scene)
     try:

@@ -33,7 +33,7 @@ _STEADY = 0.15
 
 def check_scales(
     scene: Scene, motions: Sequence[Motion], window: int | None, state: State | None = None
-) -> None:
+) -> bool:
     """Compare motions with bodies' sizes, usual speeds, planes that carry bodies, and the timestep.
 
     What is odd, but possible, raises a UserWarning.
@@ -44,16 +44,20 @@ def check_scales(
         window: Frames of the windows that motions are cut into; None for whole motions.
         state: Where planes are; default: as they were made.
 
+    Returns:
+        Whether all motions are in the scene's frame, as far as planes tell.
+
     Raises:
         ValueError: If a body moves faster than sound, or a window has more steps than anybody waits for.
     """
-    h = float(scene.timestep)
+    h, fits = float(scene.timestep), True
     for motion in motions:
         _check_times(motion.times, h, window)
         for row, name in enumerate(motion.names):
             if name in scene.names:
                 _check_positions(name, motion.times, motion.position[:, row], scene.body(name).size, h)
-                _check_planes(scene, state, motion, row)
+                fits &= _check_planes(scene, state, motion, row)
+    return fits
 
 
 def _check_times(times: np.ndarray, h: float, window: int | None) -> None:
@@ -96,18 +100,22 @@ def _check_positions(name: str, times: np.ndarray, places: np.ndarray, size: flo
         )
 
 
-def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -> None:
-    """Whether a body that planes may carry seems to lie in them, to float, or to be seen in another frame."""
+def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -> bool:
+    """Say where a body that planes may carry seems to lie in them, to float, or to be seen in another frame.
+
+    Returns:
+        Whether it is not seen in another frame.
+    """
     name = motion.names[row]
     body = scene.body(name)
     if body.surface is None or body.surface.turning != "fixed":
-        return
+        return True
     places = motion.position[:, row]
     turns = np.where(np.isfinite(motion.orientation[:, row]), motion.orientation[:, row], _UNTURNED)
     known = np.isfinite(places).all(axis=1)
     if known.sum() < 2:
-        return
-    seen = _Seen(places[known], turns[known], motion.point == "origin")
+        return True
+    fits, seen = True, _Seen(places[known], turns[known], motion.point == "origin")
     planes = {a if b == name else b for a, b in scene.pairs if name in (a, b)}
     for other in sorted(planes):
         plane = scene.body(other)
@@ -129,6 +137,7 @@ def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -
         ]
         text = _beside(gaps, motion.times[known], body.size)
         if better:
+            fits = False
             warnings.warn(
                 f"{name!r} does not move along {other!r} as it is, but does {better[0]}: is the motion in"
                 " another frame?",
@@ -143,6 +152,7 @@ def _check_planes(scene: Scene, state: State | None, motion: Motion, row: int) -
                 " scale of the film do not fit the scene, or the scene's plane lies elsewhere",
                 stacklevel=5,
             )
+    return fits
 
 
 class _Seen(NamedTuple):

@@ -139,6 +139,7 @@ class MuJoCoEngine(AbstractEngine):
         return _filled(scene, State(*(jnp.asarray(x, dtype) for x in found), names=scene.names))
 
     def _check(self, scene: Scene) -> None:
+        scene.check_weighed()
         if scene.names != self.names:
             raise ValueError(f"scene must have the bodies {list(self.names)}, got {list(scene.names)}")
         joints = tuple((joint.parent, joint.child, joint.kind) for joint in scene.joints)

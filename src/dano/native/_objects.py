@@ -81,7 +81,9 @@ class Launch:
         self._call(*self._given)
 
 
+# One thread makes objects at a time: Warp's code and Python's parser are for one.
 _loading = threading.Lock()
+_loaded: dict[tuple[Features, str], tuple[bytes, dict[str, Layout]]] = {}
 _numbers = iter(range(10**12))
 
 
@@ -104,13 +106,14 @@ def cpu_kernel(features: Features, module: str, name: str, *, what: str = "the s
 
 
 def _module(features: Features, module: str, what: str) -> tuple[bytes, dict[str, Layout]]:
-    with _loading:
-        return _loaded(features, module, what)
-
-
-@functools.cache
-def _loaded(features: Features, module: str, what: str) -> tuple[bytes, dict[str, Layout]]:
     """A module in this process: its handle, and layouts of its kernels."""
+    with _loading:
+        if (features, module) not in _loaded:
+            _loaded[features, module] = _found_or_made(features, module, what)
+        return _loaded[features, module]
+
+
+def _found_or_made(features: Features, module: str, what: str) -> tuple[bytes, dict[str, Layout]]:
     for path in _places(features, module):
         found = _read(path, fingerprint(features, module))
         if found is not None and (handle := _load(_object(path))) is not None:

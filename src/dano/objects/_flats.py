@@ -16,6 +16,8 @@ from dano.objects._surface import SurfaceSamples
 _SCATTER, _RIM = 0.1, 0.35
 # Least cosines between normals and that of the plane: of what tells a plane, and of its rim.
 _ALONG, _AT_RIM = np.cos(np.radians(5)), 0.3
+# How far what was moved onto a plane is from it, by rounding.
+_EXACT = 1e-3
 # A ball's cap within the scatter has a quarter of its area within a quarter of that, a plane nearly all.
 _CORE, _IN_CORE = 0.25, 0.8
 # Least width of a flat region, in cells, and its least share of the surface.
@@ -59,6 +61,23 @@ def flattened(surface: SurfaceSamples, spacing: ArrayLike) -> SurfaceSamples:
         moved[rim] -= (moved[rim] @ plane.normal - plane.offset)[:, None] * plane.normal
         left &= ~(rim & (normals @ plane.normal > _ALONG))
     return SurfaceSamples(floating(moved), surface.normals, surface.areas, surface.vectors)
+
+
+def flat_share(surface: SurfaceSamples, spacing: ArrayLike) -> float:
+    """Share of the area of a surface whose samples lie on planes, as `flattened` leaves them."""
+    points, normals, areas = (
+        np.asarray(x, dtype=np.float64) for x in (surface.points, surface.normals, surface.areas)
+    )
+    cell = float(np.max(np.asarray(spacing)))
+    left, flat = np.ones(len(points), dtype=bool), 0.0
+    for _ in range(_PLANES):
+        plane, region = _largest(points, normals, areas * left, cell)
+        if plane is None:
+            break
+        exact = left & (np.abs(points @ plane.normal - plane.offset) < _EXACT * cell)
+        flat += areas[exact].sum()
+        left &= ~(exact | region)
+    return float(flat / areas.sum())
 
 
 def _largest(

@@ -35,6 +35,10 @@ _SURROUNDED = 0.7
 """Share of a hollow's border that must lie within two cells of the dense part; pockets in a haze have
 less."""
 
+_LEAST_NODES = 6
+_EVEN = 0.3
+"""Share of the slope of a distance by which the middle half of its slopes on the border differ."""
+
 _BALL = np.ones((3, 3, 3))
 """A node and its neighbours, those over corners included."""
 
@@ -218,6 +222,24 @@ def _is_tight(
         if (border & near).sum() >= _SURROUNDED * border.sum():
             return False
     return True
+
+
+def is_distance(field: GridField) -> bool:
+    """Whether a density looks like a distance, which is zero within its object and grows evenly outside.
+
+    The object of such a density would be what lies around.
+    """
+    values = np.asarray(field.values, np.float64)
+    if min(values.shape) < _LEAST_NODES:
+        return False
+    inner = tuple(slice(n // 4, n - n // 4) for n in values.shape)
+    border = np.ones(values.shape, bool)
+    border[1:-1, 1:-1, 1:-1] = False
+    if values[border].mean() <= 2 * values[inner].mean():
+        return False
+    slopes = np.linalg.norm(np.gradient(values, *np.asarray(field.spacing, np.float64)), axis=0)
+    low, middle, high = np.quantile(slopes[border & (values > 0)], [0.25, 0.5, 0.75])
+    return bool(high - low < _EVEN * middle)
 
 
 def _filled(values: np.ndarray, level: float, gap: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import warnings
 from collections.abc import Mapping
 from typing import get_args, Literal
 
@@ -16,8 +17,8 @@ from dano.keys import folded_key, split_key
 from dano.maths import checked_array, checked_key, checked_points, floating, is_traced, Numbers
 from dano.memory import check_nodes
 from dano.notebook import card, cloud, numbers
-from dano.objects._flats import flattened
-from dano.objects._interior import examine, Interior, sealed
+from dano.objects._flats import flat_share, flattened
+from dano.objects._interior import examine, Interior, is_distance, sealed
 from dano.objects._mass import (
     check_scale,
     checked_density,
@@ -41,6 +42,9 @@ from dano.objects._surface import draw_surface, equal_areas, SurfaceSamples
 
 MassModel = Literal["auto", "density", "solid"]
 FORMAT, VERSION = OBJECT
+
+_FLAT = 0.95
+"""Share of the surface of a body of flat faces that is flat, at least."""
 
 _MOST_SAMPLES = 200_000
 """As many contact samples take two minutes and 3 GB; a hundredth of them do for most purposes."""
@@ -148,6 +152,13 @@ class NeuralObject(eqx.Module):
         key = checked_key(key)
         sampling_key, mass_key = split_key(key)
         original = field
+        if isinstance(field, GridField) and is_distance(field):
+            warnings.warn(
+                "the density is smallest in the middle and grows evenly to the border of its grid, as a"
+                " distance does: the object is what lies around; for signed distances there is"
+                " dano.fields.SignedDistanceGrid",
+                stacklevel=2,
+            )
         field, density, lattice, interior = _closed(original, resolution)
         level = float(interior.level)
         model, reason = _weighed(original, interior, mass_model)
@@ -207,7 +218,8 @@ class NeuralObject(eqx.Module):
             field: Grid for other objects' samples to query; without it the object meets shapes only.
 
         Raises:
-            ValueError: If a shape or value is out of range.
+            ValueError: If a shape or value is out of range, or the centre of mass lies farther beside the
+                points than these are apart.
         """
         points = checked_points("points", points)
         density = checked_array("density", density, (points.shape[0],))
@@ -217,6 +229,7 @@ class NeuralObject(eqx.Module):
                 f"[{float(density.min())}, {float(density.max())}]"
             )
         properties = MassProperties(mass, com, inertia)
+        _check_com(points, properties.com)
         if normals is None:
             outward = np.asarray(points) - np.asarray(properties.com)
             normals = floating(outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12))
@@ -245,6 +258,14 @@ class NeuralObject(eqx.Module):
     def size(self) -> float:
         """Largest extent of the samples [m]."""
         return float(np.ptp(np.asarray(self.samples.points), axis=0).max())
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether nearly all of the surface are flat faces, whose samples lie on their planes."""
+        solid, surface = self.solid, self.surface
+        if not isinstance(solid, SignedDistanceGrid) or is_traced(surface.points, solid.spacing):
+            return False
+        return flat_share(surface, solid.spacing) > _FLAT
 
     def save(self, path: str | os.PathLike[str], *, look: Mapping[str, np.ndarray] | None = None) -> None:
         """Write the object to one file (a zip of arrays, no pickle), replacing another only when complete.
@@ -458,3 +479,17 @@ def _stored_surface(
     if solid is not None:
         return draw_surface(solid, len(samples.points))
     return SurfaceSamples(samples.points, samples.normals, equal_areas(samples.points, mass))
+
+
+def _check_com(points: Float[Array, "n 3"], com: Float[Array, "3"]) -> None:
+    """Check that a centre of mass lies about where the points are; one point alone says nothing."""
+    if is_traced(points, com):
+        return
+    low, high = (np.asarray(end(np.asarray(points), axis=0)) for end in (np.min, np.max))
+    size = float((high - low).max())
+    beside = float(np.linalg.norm(np.maximum(0, np.maximum(low - np.asarray(com), np.asarray(com) - high))))
+    if size and beside > size:
+        raise ValueError(
+            f"com must lie within the body [m, F], got {np.asarray(com).tolist()}, {beside:.3g} m beside"
+            f" points that span {size:.3g} m"
+        )

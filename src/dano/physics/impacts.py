@@ -14,9 +14,6 @@ import warp as wp
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, real, TWO, vec3, ZERO
 
-# F: momentum that the damper passes on, by that of the common mass, for each speed that is missing. The
-# softer, the more samples share an impact; goals make up for it.
-_FACTOR = wp.constant(real(100.0))
 # Least share of a step after an impact.
 _LATEST = wp.constant(real(1e-6))
 
@@ -48,6 +45,8 @@ class Impact:
         share: β, share of the contact that is an impact and no lasting contact [1].
         stiffness: κ [Pa s/m], zero where bodies have not sunk in far enough.
         depth: δ [m].
+        factor: F, momentum that the damper passes on, by that of the common mass, for each speed that is
+            missing [1]. The softer, the more samples share an impact; goals make up for it.
         deepest: Depth that another part of the body may have at the end of the step, where its impact is left
             to the next one [m].
         part: Share of the impact that the pair carries, ½ where samples of both bodies do [1].
@@ -60,6 +59,7 @@ class Impact:
     share: real
     stiffness: real
     depth: real
+    factor: real
     deepest: real
     part: real
     delays: real
@@ -82,10 +82,11 @@ def fading_in(x: real) -> real:
 
 
 @wp.func
-def no_impact(depth: real, deepest: real, h: real) -> Impact:
+def no_impact(depth: real, factor: real, deepest: real, h: real) -> Impact:
     """That of contact that lasts: nothing happens within the step of length h."""
     impact = Impact()
     impact.depth = depth
+    impact.factor = factor
     impact.deepest = deepest
     impact.part = ONE
     impact.rest = h
@@ -149,14 +150,16 @@ def share_of_impact(patch: Patch, bounce: real) -> real:
 
 
 @wp.func
-def stiffness_of_impact(first: BodyState, second: BodyState, patch: Patch, bounce: real, h: real) -> real:
+def stiffness_of_impact(
+    first: BodyState, second: BodyState, patch: Patch, bounce: real, factor: real, h: real
+) -> real:
     """κ [Pa s/m] of a patch whose bodies have met, such that β is its share of how velocities change."""
     arm = patch.arm / patch.load
     normal = patch.normal / patch.load
     inverse_mass = effective_inverse_mass(first, arm, normal)
     inverse_mass += effective_inverse_mass(second, arm + first.position - second.position, normal)
     share = share_of_impact(patch, bounce)
-    return share * _FACTOR / ((ONE + (ONE - share) * _FACTOR) * h * inverse_mass * patch.load)
+    return share * factor / ((ONE + (ONE - share) * factor) * h * inverse_mass * patch.load)
 
 
 @wp.func
@@ -188,7 +191,7 @@ def impact_goal(
     rebound = -restitution * meets
     rebounds = smooth_step(TWO * rebound / bounce - ONE)
     after = rebounds * (rebound + gains) + (ONE - rebounds) * impact.way * wp.min(approach, ZERO)
-    return after + wp.max(after - approach, ZERO) / _FACTOR
+    return after + wp.max(after - approach, ZERO) / impact.factor
 
 
 @wp.func

@@ -9,6 +9,7 @@ import numpy as np
 from dano.checks import shown
 from dano.fields import AbstractShape, HalfSpace, Sphere
 from dano.maths import Pose, quat_conjugate, quat_multiply
+from dano.robots._free import FREE_JOINTS, without_free_laws
 from dano.robots._geometry import checked_collision, shape_of
 from dano.robots._inertia import balanced, chained, Inertial
 from dano.robots._parts import (
@@ -17,6 +18,7 @@ from dano.robots._parts import (
     inertials_of,
     Parts,
     parts_of,
+    placeholders_of,
     without_lacking,
     without_weightless,
 )
@@ -26,6 +28,7 @@ from dano.robots.formats import (
     Connection,
     Description,
     EQUALITIES,
+    MASSES,
     Placed,
     rotation_of,
     Solid,
@@ -55,11 +58,13 @@ def build_robot(
     shapes = checked_collision(collision, [link.name for link in description.links])
     ignored = checked_ignore(ignore)
     description = without_lacking(description, ignored)
+    description = without_free_laws(description, ignored=FREE_JOINTS in ignored)
     if balance_inertia:
         description = balanced(description)
     description = without_weightless(description, ignored)
     parts = parts_of(description, place)
-    inertials = inertials_of(parts)
+    weighed = MASSES not in ignored
+    inertials = inertials_of(parts) if weighed else placeholders_of(parts)
     for note in description.notes:
         warnings.warn(f"{description.source}: {note}", UserWarning, stacklevel=3)
     bodies: list[Body] = []
@@ -68,7 +73,7 @@ def build_robot(
     places: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     carriers = {joint.parent for joint in description.joints if joint.kind not in ("weld", FLOATING)}
     for name, members in parts.groups.items():
-        made = _bodies(parts, name, prefix, shapes, inertials.get(name))
+        made = _bodies(parts, name, prefix, shapes, inertials.get(name), weighed=weighed)
         for link, where in members.items():
             stands = _as_arrays(chained(parts.places[name], where))
             frames[link] = (made[0][0].name, *_as_arrays(where)) if made else (None, *stands)
@@ -101,7 +106,13 @@ def build_robot(
 
 
 def _bodies(
-    parts: Parts, name: str, prefix: str, shapes: Mapping[str, str], inertial: Inertial | None
+    parts: Parts,
+    name: str,
+    prefix: str,
+    shapes: Mapping[str, str],
+    inertial: Inertial | None,
+    *,
+    weighed: bool,
 ) -> list[tuple[Body, bool]]:
     """The bodies of a group, and whether each has a shape; none for what stands still without one."""
     description = parts.description
@@ -131,7 +142,7 @@ def _bodies(
     held = next((link.gravcomp for link, _ in links if link.mass > 0 and link.gravcomp), None)
     geometry = Sphere(_MARK) if shape is None else shape
     try:
-        body = Body(name, geometry, mass=mass, com=com, inertia=inertia, gravcomp=held)
+        body = Body(name, geometry, mass=mass, com=com, inertia=inertia, gravcomp=held, weighed=weighed)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     return [(body, shape is not None)]

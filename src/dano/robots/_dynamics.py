@@ -221,7 +221,7 @@ def _of_joints(scene: Scene, rows: Float[Array, "k *n"]) -> Float[Array, "j *n"]
 
 def _masses(scene: Scene) -> tuple[Float[Array, " m"], Float[Array, "m 3 3"], np.ndarray]:
     """Mass [kg] and inertia [kg m², B] of the bodies that move, and which they are."""
-    checked_kind("scene", scene, Scene)
+    checked_kind("scene", scene, Scene).check_weighed()
     rows = np.array(scene.layout.moving, int)
     bodies = [scene.bodies[i] for i in rows]
     numbers = [(body.mass, body.inertia, body.mass_scale) for body in bodies]

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from dano.robots._free import FREE_JOINTS, laws_of
 from dano.robots._inertia import excess, grouped_links, own_inertials, ROUNDED, weightless_joints
 from dano.robots.formats import Connection, Description, Link, WEIGHTLESS
 
@@ -111,6 +112,11 @@ def _of_link(link: Link) -> list[str]:
 
 def _of_joint(joint: Connection) -> list[str]:
     where, doubts = f"joint {joint.name!r}", []
+    if laws := laws_of(joint):
+        doubts.append(
+            f"{where}: is free and has {' and '.join(laws)}: three slides and a ball stand for it;"
+            f" ignore=[{FREE_JOINTS!r}] leaves that out"
+        )
     if joint.limits is not None:
         low, high = joint.limits
         if low == high:

@@ -32,7 +32,7 @@ def load_urdf(
             `export`); "none" (as False), no shape at all. Or such a word by the names of links; the others
             have hulls. What was computed is kept in the user's cache folder.
         ignore: What to leave out by name, such as "weightless joints": joints that move nothing with mass,
-            which then stay where they are.
+            which then stay where they are; or "masses", all of them: the robot then serves kinematics.
         balance_inertia: Whether a link with an impossible inertia gets the mean of its three principal
             moments for each, as MuJoCo's `balanceinertia` does it. Otherwise it is an error.
 

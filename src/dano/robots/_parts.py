@@ -25,6 +25,7 @@ from dano.robots.formats import (
     GRAVCOMP,
     held_at,
     Lacking,
+    MASSES,
     Placed,
     WEIGHTLESS,
     without_followers,
@@ -151,6 +152,12 @@ def inertials_of(parts: Parts) -> dict[str, Inertial]:
     return found
 
 
+def placeholders_of(parts: Parts) -> dict[str, Inertial]:
+    """Masses of all groups that move, in place of those that are left out: a kilogram in a ball of 0.2 m."""
+    moving = [name for name in parts.groups if name not in parts.fixed]
+    return {name: (1.0, np.zeros(3), 0.4 * 0.1**2 * np.eye(3)) for name in moving}
+
+
 def _check_possible(where: str, name: str, inertia: np.ndarray) -> None:
     share = excess(inertia)
     if share > ROUNDED:
@@ -169,13 +176,16 @@ def without_weightless(description: Description, ignored: Sequence[str]) -> Desc
         ValueError: If there are some, and they are not.
     """
     groups = grouped_links(description)
+    if MASSES in ignored:
+        return description
     while names := weightless_joints(description, groups, own_inertials(description, groups)):
         if WEIGHTLESS not in ignored:
             shown_names = ", ".join(map(repr, names[:4])) + (" …" if len(names) > 4 else "")
             raise ValueError(
                 f"{description.source}: mass must be > 0 kg, and the inertia about its axis, of what each"
                 f" joint moves by itself, got none for {shown_names}: give the links mass or the joint"
-                f" armature, or hold it where it is with ignore=[{WEIGHTLESS!r}]"
+                f" armature, or hold it where it is with ignore=[{WEIGHTLESS!r}]; kinematics alone needs no"
+                f" mass, with ignore=[{MASSES!r}]"
             )
         joints = [
             held_at(joint, joint.home) if joint.name in names else joint for joint in description.joints

@@ -282,7 +282,10 @@ class Robot:
         checked_kind("scene", scene, Scene)
         given = self.start(q, v)
         for name, values in others.items():
-            given[name] = {**given.get(name, {}), **values}
+            own = given.get(name, {})
+            if "origin" in values:
+                own = {key: value for key, value in own.items() if key != "position"}
+            given[name] = {**own, **values}
         return scene.state_of(given, {body: name for name, body in self.joint_names.items()})
 
     def control(

@@ -9,7 +9,16 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_optional, checked_text
 from dano.contact import Collider, ContactParams, SampleSet, Support, SurfaceSet
-from dano.fields import AbstractField, AbstractShape, Ellipsoid, HalfSpace, SignedDistanceGrid, Sphere
+from dano.fields import (
+    AbstractField,
+    AbstractShape,
+    Box,
+    Cylinder,
+    Ellipsoid,
+    HalfSpace,
+    SignedDistanceGrid,
+    Sphere,
+)
 from dano.hosted import hosted
 from dano.maths import (
     AnyArray,
@@ -17,6 +26,7 @@ from dano.maths import (
     checked_array,
     checked_quaternion,
     floating,
+    is_traced,
     library,
     Numbers,
     Q,
@@ -38,16 +48,13 @@ LAYER = 0.02
 
 # Quantities of a start, and how many numbers each has; of joints as many as they have coordinates.
 _START = {
-    "position": 3,
-    "origin": 3,
-    "orientation": 4,
-    "velocity": 3,
-    "omega": 3,
-    "spin_world": 3,
-    "q": None,
-    "v": None,
+    **{"position": 3, "origin": 3, "orientation": 4, "velocity": 3, "omega": 3, "spin_world": 3},
+    **{"q": None, "v": None},
 }
-_ARGUMENTS = (*_START, "mass", "inertia", "com", "mass_scale", "com_offset", "material", "gravcomp", "fixed")
+_ARGUMENTS = (
+    *_START,
+    *"mass inertia com mass_scale com_offset material gravcomp fixed weighed".split(),
+)
 
 
 class Body(eqx.Module):
@@ -73,6 +80,7 @@ class Body(eqx.Module):
         material: Contact parameters for pairs that no contact of a scene names; None: the scene's.
         gravcomp: Share of the weight that is held, as by a spring balance [1]; None: none.
         fixed: Whether the body never moves.
+        weighed: Whether its mass is known (static).
         start: Where `Scene.initial_state` puts it if nothing else is said: some of `position, orientation,
             velocity, omega, origin, q, v`.
     """
@@ -93,6 +101,7 @@ class Body(eqx.Module):
     material: ContactParams | None
     gravcomp: Float[Array, ""] | None
     fixed: bool = eqx.field(static=True)
+    weighed: bool = eqx.field(static=True)
     start: dict[str, Array]
 
     def __init__(
@@ -108,6 +117,7 @@ class Body(eqx.Module):
         material: ContactParams | None = None,
         gravcomp: Numbers | None = None,
         fixed: bool = False,
+        weighed: bool = True,
         **start: Numbers | None,
     ):
         """A body from a neural object (which brings its mass) or a shape (homogeneous, of the given mass).
@@ -125,6 +135,8 @@ class Body(eqx.Module):
             gravcomp: Share of the weight that is held: 1 and gravity does not pull at the body, more and it
                 rises. As MuJoCo's.
             fixed: Whether the body never moves; then it needs no mass.
+            weighed: Whether the mass is known. A scene with a body that moves and whose mass stands for one
+                that nobody knows serves kinematics alone: it is not stepped.
             **start: Where it starts if `Scene.initial_state` is not told otherwise: `position` of the centre
                 of mass, or `origin` of the field frame [m, W], `orientation` (wxyz), `velocity` [m/s, W],
                 `omega` [rad/s, B] or `spin_world` [rad/s, W]; on a joint `q` and `v`.
@@ -135,7 +147,7 @@ class Body(eqx.Module):
         """
         keep_programs()
         self.name = checked_text("name", name)
-        self.fixed = bool(fixed)
+        self.fixed, self.weighed = bool(fixed), bool(weighed)
         self.material = checked_optional(f"material of body {name!r}", material, ContactParams)
         self.samples = self.support = self.surface = self.extent = self.object = self.shape = None
         self.density_scale = floating(1.0)
@@ -176,8 +188,7 @@ class Body(eqx.Module):
         if self.object is not None:
             return self.object.size
         assert self.shape is not None
-        extent = np.ptp(np.asarray(self.shape.bounds), axis=0)
-        return float(extent.max())
+        return float(np.ptp(np.asarray(self.shape.bounds), axis=0).max())
 
     @property
     def field(self) -> AbstractField | None:
@@ -188,6 +199,20 @@ class Body(eqx.Module):
     def solid(self) -> AbstractShape | None:
         """What other bodies' surface samples press on: the shape, or the object's signed distance."""
         return self.shape if self.object is None else self.object.solid
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether edges and faces of the surface are known exactly; of objects, those of flat faces are."""
+        if self.object is not None:
+            return self.object.is_flat
+        if isinstance(self.shape, Box):
+            return not is_traced(self.shape.rounding) and float(self.shape.rounding) == 0
+        return isinstance(self.shape, Cylinder)
+
+    @property
+    def is_plane(self) -> bool:
+        """Whether the body is a half-space."""
+        return isinstance(self.shape, HalfSpace)
 
     @property
     def centre_of_mass(self) -> Float[Array, "3"]:

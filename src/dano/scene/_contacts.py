@@ -93,7 +93,10 @@ class Contact(eqx.Module):
 
 
 def prepared(
-    bodies: Sequence[Body], contacts: Sequence[Contact], gravity: Float[Array, "3"]
+    bodies: Sequence[Body],
+    contacts: Sequence[Contact],
+    timestep: Float[Array, ""],
+    gravity: Float[Array, "3"],
 ) -> tuple[tuple[Body, ...], tuple[Contact, ...]]:
     """Bodies with the samples that their contacts need, and contacts with all defaults filled in.
 
@@ -122,10 +125,16 @@ def prepared(
     for contact in contacts:
         a, b = by_name[contact.a], by_name[contact.b]
         stiffness = functools.partial(_stiffness, a, b, weight, carried)
-        setting = Setting(min(sizes[a.name], sizes[b.name]), strength, stiffness)
+        size = min(sizes[a.name], sizes[b.name])
+        setting = Setting(size, strength, stiffness, timestep, is_sharp(a, b))
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
     return tuple(by_name[body.name] for body in bodies), tuple(completed)
+
+
+def is_sharp(a: Body, b: Body) -> bool:
+    """Whether edges and faces of one body, known exactly, meet a plane."""
+    return (a.is_plane and b.is_flat) or (b.is_plane and a.is_flat)
 
 
 def colliders(

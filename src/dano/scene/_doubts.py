@@ -1,12 +1,12 @@
 """What is odd about a scene or a state, and hints at other units, another frame or a slip: said once.
 
 Every doubt is a test of numbers that are there anyway. None is made of traced values. Bodies whose inertia is
-that of something larger than their shape, such as links with a mark, are not judged by their shape.
+that of something larger than their shape are not judged by their shape, nor are links that touch nothing.
 """
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import jax
@@ -34,7 +34,13 @@ _NO_LENGTHS = ("normal", "offset", "rounding")
 _STRONGEST = 100.0
 """Gravity [m/s²] beyond that of all planets, and of centrifuges for people."""
 _FAR = 3.0
-"""Sizes from a body's middle at which an anchor is rather given in another frame."""
+"""Sizes from a body's middle at which an anchor, or a centre of mass, is rather given in another frame."""
+_WIDEST_EDGE = 1.0
+"""Share of a shape's thickness from which the smooth edge reaches through it."""
+_COARSE = 1e-3
+"""Share of a body's size by which places may be rounded."""
+_SHORTEST = 1e-7
+"""Timestep [s] below which it is rather given in another unit."""
 _TURNS = 10.0
 """Whole numbers beyond these, as limits of a hinge, are rather degrees [rad]."""
 _LEAPS = 10.0
@@ -79,8 +85,20 @@ def doubts_of_scene(
     joints: Sequence[Joint],
     contacts: Sequence[Contact],
     gravity: Float[Array, "3"],
+    meeting: Collection[str],
 ) -> list[Doubt]:
-    """What is odd about what stays constant."""
+    """What is odd about what stays constant.
+
+    Args:
+        bodies: All bodies.
+        joints: All joints.
+        contacts: Those that are named.
+        gravity: [m/s²].
+        meeting: Names of the bodies that may touch something. The shape of what hangs on a joint, or carries
+            one, and touches nothing is only seen: a mark of a link, mostly.
+    """
+    linked = {name for joint in joints for name in (joint.parent, joint.child)}
+    seen = linked - set(meeting)
     found = []
     if len(bodies) > 1 and all(body.fixed for body in bodies):
         found.append(Doubt(2, "nothing moves: all bodies are fixed"))
@@ -93,12 +111,13 @@ def doubts_of_scene(
             found.append(Doubt(3, f"{text} has: it is a ratio of forces, not an angle"))
         found += _too_soft(contact, bodies, gravity)
     for body in bodies:
-        if not body.fixed and not is_traced(body.shape, body.mass, body.mass_scale, body.inertia):
+        traced = is_traced(body.shape, body.mass, body.mass_scale, body.inertia)
+        if not body.fixed and not traced and body.name not in seen:
             found += _of_body(body)
     by_name = {body.name: body for body in bodies}
     for joint in joints:
         if not is_traced(joint):
-            found += _of_joint(joint, by_name)
+            found += _of_joint(joint, None if joint.child in seen else by_name[joint.child])
     if not is_traced(gravity) and float(np.linalg.norm(np.asarray(gravity))) > _STRONGEST:
         strength = float(np.linalg.norm(np.asarray(gravity)))
         found.append(Doubt(1, f"gravity is {strength:.4g} m/s²: that of the earth is 9.81"))
@@ -118,12 +137,13 @@ def _too_soft(contact: Contact, bodies: Sequence[Body], gravity: Float[Array, "3
         if is_traced(body.surface, body.mass, body.mass_scale, body.scale) or not np.isfinite(body.size):
             continue
         weight = float(body.mass * body.mass_scale) * float(np.linalg.norm(np.asarray(gravity)))
+        other = contact.b if body.name == contact.a else contact.a
         if float(stiffness) * body.typical_support(_SOFT * body.size) < weight:
             found.append(
                 Doubt(
                     3,
                     f"{body.name!r} sinks by more than {100 * _SOFT:.0f} % of its size where it rests: its"
-                    f" stiffness of {float(stiffness):.3g} Pa/m with {contact.a!r} or {contact.b!r} is small",
+                    f" stiffness of {float(stiffness):.3g} Pa/m with {other!r} is small",
                 )
             )
     return found
@@ -155,10 +175,16 @@ def density_doubt(body: Body) -> str | None:
 
 
 def _extents(body: Body) -> Float[np.ndarray, "3"]:
+    return np.ptp(_bounds(body), axis=0)
+
+
+def _bounds(body: Body) -> Float[np.ndarray, "2 3"]:
+    """Lower and upper corner of the box around a body [m, F]."""
     if body.object is not None:
-        return np.ptp(np.asarray(body.object.surface.points, np.float64), axis=0)
+        points = np.asarray(body.object.surface.points, np.float64)
+        return np.stack([points.min(axis=0), points.max(axis=0)])
     assert body.shape is not None
-    return np.ptp(np.asarray(body.shape.bounds, np.float64), axis=0)
+    return np.asarray(body.shape.bounds, np.float64)
 
 
 def _of_body(body: Body) -> list[Doubt]:
@@ -169,11 +195,30 @@ def _of_body(body: Body) -> list[Doubt]:
         found.append(Doubt(0, text))
     elif _LONGEST < body.size < np.inf:
         found.append(Doubt(0, f"{body.name!r} is {body.size:.3g} m long: are its lengths in metres?"))
+    if (away := _beside(body)) > _FAR * body.size:
+        text = (
+            f"the centre of mass of {body.name!r} lies {away:.3g} m beside its shape, {away / body.size:.2g}"
+            " times its size: it is a point of the body's own frame"
+        )
+        found.append(Doubt(3, text))
     thin = _thickness(body)
+    edge = getattr(body.shape, "edge", None)
+    if edge is not None and not is_traced(edge) and float(edge) > _WIDEST_EDGE * thin:
+        text = f"the edge of {body.name!r} is {float(edge):.3g} m wide and its shape {thin:.3g} m thick"
+        found.append(Doubt(3, f"{text}: it has no inside"))
     if thin < _THINNEST * body.size:
         text = f"{body.name!r} is {thin:.2g} m thick and {body.size:.2g} m long: too thin for its samples"
         found.append(Doubt(5, text))
     return found
+
+
+def _beside(body: Body) -> float:
+    """How far the centre of mass lies beside the box around a body [m]; 0 of what has none or is endless."""
+    if not np.isfinite(body.size) or is_traced(body.com):
+        return 0.0
+    low, high = _bounds(body)
+    com = np.asarray(body.com, np.float64)
+    return float(np.linalg.norm(np.maximum(0, np.maximum(low - com, com - high))))
 
 
 def _thickness(body: Body) -> float:
@@ -182,8 +227,9 @@ def _thickness(body: Body) -> float:
     return min((2 * float(np.min(np.asarray(getattr(body.shape, name)))) for name in names), default=np.inf)
 
 
-def _of_joint(joint: Joint, bodies: dict[str, Body]) -> list[Doubt]:
-    found, body = [], bodies[joint.child]
+def _of_joint(joint: Joint, body: Body | None) -> list[Doubt]:
+    """Limits in degrees, and anchors far from a body; None for one that is not judged by its shape."""
+    found = []
     if joint.kind == "hinge" and joint.limits is not None:
         ends = np.asarray(joint.limits, np.float64)
         finite = ends[np.isfinite(ends)]
@@ -197,6 +243,8 @@ def _of_joint(joint: Joint, bodies: dict[str, Body]) -> list[Doubt]:
                     f" {turns:.3g} turns: are they in degrees?",
                 )
             )
+    if body is None:
+        return found
     shown = body.shape if body.object is None else body.object.solid
     # A robot's link may hang on an axis far from what it is seen by.
     if shown is not None and np.isfinite(body.size) and is_homogeneous(body) and not is_traced(body.com):
@@ -232,8 +280,14 @@ def doubts_of_state(
     found = []
     position, speeds = np.asarray(state.position, np.float64), np.asarray(state.velocity, np.float64)
     spins, orientation = np.asarray(state.omega, np.float64), np.asarray(state.orientation, np.float64)
+    rounding = float(np.finfo(state.position.dtype).eps)
     for i in layout.free:
         body = bodies[i]
+        far = float(np.abs(position[i]).max())
+        if np.isfinite(body.size) and far * rounding > _COARSE * body.size:
+            apart = f"where numbers are {far * rounding:.1g} m apart"
+            text = f"{body.name!r} lies {far:.3g} m from the origin, {apart}"
+            found.append(Doubt(2, f"{text}: is its position in metres?"))
         way = float(np.linalg.norm(speeds[i])) * timestep
         if np.isfinite(body.size) and way > _LEAPS * body.size and way > 0:
             found.append(
@@ -260,11 +314,30 @@ def doubts_of_state(
         names = ", ".join(repr(bodies[i].name) for i in layout.free[:3])
         text = f"orientation [0, 0, 0, 1] of {names} is a half turn about z: quaternions are wxyz"
         found.append(Doubt(4, f"{text}, and no turn is [1, 0, 0, 0]"))
+    found += _of_coordinates(bodies, layout, state)
+    if timestep < _SHORTEST:
+        text = (
+            f"timestep {timestep:.3g} s is short: a second takes {1 / timestep:.2g} steps; is it in seconds?"
+        )
+        found.append(Doubt(3, text))
     for i, body in enumerate(bodies):
         if body.fixed and (np.any(speeds[i]) or np.any(spins[i])):
             found.append(Doubt(3, f"{body.name!r} is fixed: the velocity of its state moves nothing"))
     for i, j in pairs:
         found += _begins_inside(bodies, position, orientation, i, j)
+    return found
+
+
+def _of_coordinates(bodies: Sequence[Body], layout: Layout, state: State) -> list[Doubt]:
+    """Angles of hinges that are rather in degrees."""
+    found = []
+    for joint, _, place in layout.dofs:
+        if state.q is None or layout.kinds[joint] != "hinge" or layout.follows[joint]:
+            continue
+        q = float(state.q[place])
+        if abs(q) > _TURNS and q == round(q):
+            name, turns = bodies[layout.children[joint]].name, abs(q) / (2 * np.pi)
+            found.append(Doubt(4, f"q of {name!r} is {q:g} rad, {turns:.3g} turns: is it in degrees?"))
     return found
 
 

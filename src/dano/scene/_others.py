@@ -4,6 +4,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,13 +15,32 @@ from jaxtyping import Array, Float
 from dano.checks import shown
 from dano.contact import combined, ContactParams, DistributedLaw, Setting
 from dano.scene._bodies import Body
-from dano.scene._contacts import check_objects, checked_support, Contact, heaviest, with_surface
+from dano.scene._contacts import (
+    check_objects,
+    checked_support,
+    Contact,
+    heaviest,
+    is_sharp,
+    with_surface,
+)
 from dano.scene._joints import joined, Joint
 from dano.scene._loops import Loop
 
 MOST_LISTED = 200
 """Pairs that a scene lists as contacts unasked: those of twenty bodies. A contact takes 8 ms to make, and its
 numbers are leaves of the scene; `Others` holds those of thousands in arrays."""
+
+
+class OnPlanes(NamedTuple):
+    """Parameters of each body where edges and faces meet a plane, arrays of shape (n,).
+
+    Attributes:
+        stiffness: k [Pa/m].
+        impact_depth: δ [m].
+    """
+
+    stiffness: Float[Array, " n"]
+    impact_depth: Float[Array, " n"]
 
 
 class Others(eqx.Module):
@@ -30,13 +50,17 @@ class Others(eqx.Module):
 
     Attributes:
         params: Of each body of the scene, arrays of shape (n,).
+        on_planes: Some of them where edges and faces meet a plane.
         law: Of all these pairs.
         pairs: Indices of the bodies of each pair (static).
+        sharp: Whether in a pair edges and faces meet a plane (static).
     """
 
     params: ContactParams
+    on_planes: OnPlanes
     law: DistributedLaw
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    sharp: tuple[bool, ...] = eqx.field(static=True)
 
     @property
     def pair_params(self) -> ContactParams:
@@ -47,7 +71,13 @@ class Others(eqx.Module):
         """
         first, second = np.array(self.pairs, int).reshape(-1, 2).T
         a, b = (jax.tree.map(lambda x, rows=rows: x[rows], self.params) for rows in (first, second))
-        return combined(a, b)
+        found = combined(a, b)
+        if not any(self.sharp):
+            return found
+        k, depth, sharp = *self.on_planes, np.array(self.sharp)
+        stiffness = jnp.where(sharp, jnp.maximum(k[first], k[second]), found.stiffness)
+        depth = jnp.where(sharp, jnp.minimum(depth[first], depth[second]), found.impact_depth)
+        return eqx.tree_at(lambda p: (p.stiffness, p.impact_depth), found, (stiffness, depth))
 
 
 def others_of(
@@ -56,6 +86,7 @@ def others_of(
     joints: Sequence[Joint | Loop],
     apart: Sequence[tuple[str, str]],
     params: ContactParams,
+    timestep: Float[Array, ""],
     gravity: Float[Array, "3"],
 ) -> tuple[tuple[Body, ...], Others | None]:
     """The bodies with what contact needs of them, and the pairs that are left; None if there are none.
@@ -66,6 +97,7 @@ def others_of(
         joints: And loops: what joins needs not touch.
         apart: Names of further pairs that do not touch.
         params: What bodies without a material of their own are made of.
+        timestep: h [s].
         gravity: [m/s², W].
 
     Raises:
@@ -92,7 +124,9 @@ def others_of(
         return tuple(bodies), None
     touching = {i for pair in pairs for i in pair}
     bodies = tuple(with_surface(body) if i in touching else body for i, body in enumerate(bodies))
-    return bodies, Others(_stacked(bodies, touching, law, params, gravity), law, tuple(pairs))
+    sharp = tuple(is_sharp(bodies[i], bodies[j]) for i, j in pairs)
+    complete, on_planes = _stacked(bodies, pairs, sharp, law, params, timestep, gravity)
+    return bodies, Others(complete, on_planes, law, tuple(pairs), sharp)
 
 
 def unnamed_contacts(
@@ -167,16 +201,19 @@ def _check_apart(bodies: Sequence[Body], apart: Sequence[tuple[str, str]]) -> No
 
 def _stacked(
     bodies: Sequence[Body],
-    touching: set[int],
+    pairs: Sequence[tuple[int, int]],
+    sharp: Sequence[bool],
     law: DistributedLaw,
     usual: ContactParams,
+    timestep: Float[Array, ""],
     gravity: Float[Array, "3"],
-) -> ContactParams:
-    """Complete parameters of all bodies as arrays.
+) -> tuple[ContactParams, OnPlanes]:
+    """Complete parameters of all bodies as arrays, and those where edges and faces meet a plane.
 
     What does not move or has no end presses as softly, and is as large, as what it may meet: the other body
     decides.
     """
+    touching = {i for pair in pairs for i in pair}
     weight, strength = heaviest(bodies, gravity)
     moving = [i for i in touching if not bodies[i].fixed]
     largest = max(bodies[i].size for i in moving)
@@ -190,8 +227,15 @@ def _stacked(
         decide = [i] if i in moving else moving
         return lambda sinking: functools.reduce(jnp.minimum, [stiffness(k, sinking) for k in decide])
 
-    complete = []
+    met = {i for pair, is_so in zip(pairs, sharp, strict=True) if is_so for i in pair}
+    complete, on_planes = [], []
     for i, body in enumerate(bodies):
         given = usual if body.material is None else body.material
-        complete.append(law.complete(given, Setting(min(body.size, largest), strength, rule(i))))
-    return jax.tree.map(lambda *x: jnp.stack(x), *complete)
+        size = min(body.size, largest)
+        complete.append(law.complete(given, Setting(size, strength, rule(i), timestep, False)))
+        there = complete[-1]
+        if i in met:
+            there = law.complete(given, Setting(size, strength, rule(i), timestep, True))
+        on_planes.append(OnPlanes(there.stiffness, there.impact_depth))
+    found, there = (jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (complete, on_planes))
+    return found, there

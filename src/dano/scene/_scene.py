@@ -43,7 +43,7 @@ from dano.scene._making import (
     warn_of_long_steps,
 )
 from dano.scene._motors import Motor
-from dano.scene._others import Others, others_of, unnamed_contacts
+from dano.scene._others import OnPlanes, Others, others_of, unnamed_contacts
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 Parts = TypeVar("Parts", tuple[Joint, ...], tuple[Loop, ...])
@@ -125,16 +125,18 @@ class Scene(eqx.Module):
         gravity = checked_array("gravity", gravity, (3,))
         # Before the bodies are prepared, which makes new ones.
         twins = twins_of(bodies)
-        bodies, contacts = prepared(bodies, contacts, gravity)
+        bodies, contacts = prepared(bodies, contacts, timestep, gravity)
         rest = None
         if others is not None:
-            bodies, rest = others_of(bodies, contacts, (*joints, *loops), apart, others, gravity)
+            joined = (*joints, *loops)
+            bodies, rest = others_of(bodies, contacts, joined, apart, others, timestep, gravity)
         check_materials(bodies, others, apart)
         if contacts or rest is not None:
             warn_of_long_steps(bodies, timestep, gravity)
-        say_doubts(doubts_of_scene(bodies, joints, contacts, gravity), stacklevel=2)
         room = room_for(bodies, timestep, gravity)
-        return cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops)
+        scene = cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops)
+        say_doubts(doubts_of_scene(bodies, joints, contacts, gravity, scene._meeting), stacklevel=2)
+        return scene
 
     def __str__(self) -> str:
         """What notebooks show, as text."""
@@ -219,6 +221,11 @@ class Scene(eqx.Module):
         rest = () if self.others is None else self.others.pairs
         named = tuple((contact.a, contact.b) for contact in self.contacts)
         return (*named, *((self.names[i], self.names[j]) for i, j in rest))
+
+    @property
+    def _meeting(self) -> set[str]:
+        """Names of the bodies that may touch something."""
+        return {name for pair in self.pairs for name in pair}
 
     def index(self, name: str) -> int:
         """Index of a body.
@@ -316,7 +323,14 @@ class Scene(eqx.Module):
                 )
         params = self.others.params
         values = [getattr(params, k).at[i].set(checked_parameter(k, value)) for k, value in changes.items()]
-        return eqx.tree_at(lambda s: [getattr(s.others.params, key) for key in changes], self, values)
+        scene = eqx.tree_at(lambda s: [getattr(s.others.params, key) for key in changes], self, values)
+        of_planes = {
+            key: value for key, value in zip(changes, values, strict=True) if key in OnPlanes._fields
+        }
+        on_planes = self.others.on_planes
+        for key, value in of_planes.items():
+            on_planes = on_planes._replace(**{key: getattr(on_planes, key).at[i].set(value[i])})
+        return eqx.tree_at(lambda s: s.others.on_planes, scene, on_planes)
 
     def replace_body(self, name: str, **changes: Numbers) -> "Scene":
         """The scene with some of a body's `mass, inertia, com, mass_scale, com_offset` changed.
@@ -413,7 +427,7 @@ class Scene(eqx.Module):
                 where they are. Default: all of them.
         """
         return [
-            *doubts_of_scene(self.bodies, self.joints, self.contacts, self.gravity),
+            *doubts_of_scene(self.bodies, self.joints, self.contacts, self.gravity, self._meeting),
             *self._doubts_of(state, given),
         ]
 
@@ -479,6 +493,19 @@ class Scene(eqx.Module):
         """
         self.check_state(state)
         return Frames(*by_numpy(frames_of)(self.chains, state))
+
+    def check_weighed(self) -> None:
+        """Check that all masses are known, as steps and forces need it.
+
+        Raises:
+            ValueError: If there are bodies without one.
+        """
+        names = [body.name for body in self.bodies if not (body.fixed or body.weighed)]
+        if names:
+            some = ", ".join(map(repr, names[:4])) + (" …" if len(names) > 4 else "")
+            raise ValueError(
+                f"scene must have bodies of known mass, got none for {some}: it serves kinematics alone"
+            )
 
     def check_state(self, state: State) -> None:
         """Check a concrete state against the scene; traced values pass.

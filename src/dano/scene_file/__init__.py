@@ -23,6 +23,13 @@ from dano.scene_file._objects import (
     object_of_file as object_of_file,
     Progress as Progress,
 )
+from dano.scene_file._parts import (
+    build_parts as build_parts,
+    materials_doubt as materials_doubt,
+    Part as Part,
+    part_of as part_of,
+    parts_of as parts_of,
+)
 from dano.scene_file._pieces import run_piece as run_piece
 from dano.scene_file._reading import (
     load_scene as load_scene,

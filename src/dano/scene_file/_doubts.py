@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from dano.contact import STANDARD_GRAVITY
 from dano.fields import AbstractField, GridField
 from dano.objects import NeuralObject
 from dano.scene import Doubt, Scene, State
@@ -10,6 +11,9 @@ from dano.scene_file._schedule import Schedule
 
 _ROUNDED = 1e-6
 """Share of a duration by which steps may miss it unsaid: rounding."""
+
+_MOST_WEIGHTS = 1e4
+"""Weights of a body beyond which a force on it is doubted."""
 
 _SHORT, _LONG = 1e-3, 5.0
 """Sizes [m] beyond which an object is rather in other units than so large or small."""
@@ -84,10 +88,25 @@ def file_doubts(
                 f"[[controls]] {i + 1} never acts: it begins at {start:.4g} s, and {duration:.4g} s are run"
             )
             found.append(Doubt(2, text))
+    found += [] if schedule is None else _of_forces(scene, schedule)
     if asked is not None and abs(duration - asked) > _ROUNDED * asked:
         text = f"duration {asked:.6g} s is no whole number of steps of {h:.6g} s: {duration:.6g} s are run"
         found.append(Doubt(3, text))
     if len(scene.bodies) > 1:
         limits = bounds(scene, scene.filled(state), duration)
         found += [Doubt(2, finding.text) for finding in support(scene, limits)]
+    return found
+
+
+def _of_forces(scene: Scene, schedule: Schedule) -> list[Doubt]:
+    """Forces that are thousands of times a body's weight."""
+    found = []
+    for i, (row, force) in enumerate(zip(schedule.body.tolist(), np.asarray(schedule.force), strict=True)):
+        body, size = scene.bodies[row], float(np.linalg.norm(force))
+        weight = float(body.mass * body.mass_scale) * STANDARD_GRAVITY
+        if not body.fixed and size > _MOST_WEIGHTS * weight:
+            text = (
+                f"[[controls]] {i + 1} pushes {body.name!r} with {size:.3g} N, {size / weight:.2g} times its"
+            )
+            found.append(Doubt(2, f"{text} weight on earth: is it in newtons?"))
     return found

@@ -30,6 +30,8 @@ ASSETS = {"bunny": 1.0, "soap": 0.15, "trained_bunny": 1.0, "trained_soap": 0.15
 """Shipped objects and their masses [kg]."""
 
 _TRAINED = "trained_"
+_ROBOTS = (".urdf", ".xml", ".mjcf", ".xacro")
+"""What files of robots end in."""
 _WATER = 1000.0
 """Density [kg/m³] of what is built of a mesh unasked."""
 
@@ -114,7 +116,11 @@ def _built_of(
 
     def build() -> Built:
         file = source if isinstance(source, str) else Path(source)
-        field = load_field(file, **({} if options is None else options.of_file))
+        with warnings.catch_warnings():
+            if options is not None and options.length is not None:
+                # A length makes up for it.
+                warnings.filterwarnings("ignore", message=".*no spacing was given")
+            field = load_field(file, **({} if options is None else options.of_file))
         chosen = _usual(isinstance(field, AbstractShape)) if options is None else options
         return _made(field, chosen, dashes, progress)
 
@@ -207,6 +213,11 @@ def load_object(
         )
     if path.is_file() and format_of(path) == TRAJECTORY[0]:
         raise ValueError(f"{path} is a run, not an object: `dano view {path}` shows it")
+    if path.suffix.lower() in _ROBOTS:
+        raise ValueError(
+            f"{path} is a robot's file, not an object: `dano inspect {path}` shows it, and [[robots]] in a"
+            " scene file simulates it"
+        )
     if path.suffix.lower() == ".dano" or path.suffix.lower() not in FIELD_SUFFIXES:
         return NeuralObject.load(path)
     return object_of_file(path, options, weighed=weighed, progress=progress)

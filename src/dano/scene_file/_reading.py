@@ -8,7 +8,7 @@ import math
 import os
 import tomllib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args, TYPE_CHECKING
@@ -287,7 +287,8 @@ def _steps(top: Table, timestep: float) -> int | float:
             f" {top.data['n_steps']!r}: keep one"
         )
     if "duration" not in top and "n_steps" not in top:
-        raise ValueError(f"{top.where}: needs either duration [s] or n_steps, got neither")
+        hint = _inside(top, ("duration", "n_steps"))
+        raise ValueError(f"{top.where}: needs either duration [s] or n_steps, got neither{hint}")
     if "n_steps" in top:
         return top.integer("n_steps", 0)
     duration = top.number("duration")
@@ -297,6 +298,17 @@ def _steps(top: Table, timestep: float) -> int | float:
     if count > 2**62:
         return count
     return max(1, round(count))
+
+
+def _inside(top: Table, keys: Sequence[str]) -> str:
+    """In which table a key stands that belongs to the whole file; in TOML all below a table is part of it."""
+    for name, tables in top.data.items():
+        rows = tables if isinstance(tables, list) else [tables]
+        for i, row in enumerate(rows):
+            for key in keys:
+                if isinstance(row, Mapping) and key in row:
+                    return f"; {key!r} stands within {name} {i + 1}: write it above all tables"
+    return ""
 
 
 def _body(row: Table, folder: Path, built: dict[object, NeuralObject], progress: Progress | None) -> Body:

@@ -7,6 +7,10 @@ from typing import Any, cast
 
 from dano.names import did_you_mean
 
+_OF_PAIRS = "; those of a pair stand in [[contacts]], of all pairs in [default_contact]"
+_ELSEWHERE = dict.fromkeys(("friction", "sliding_friction", "restitution", "stiffness"), _OF_PAIRS)
+"""What to say of keys that stand elsewhere in a scene file."""
+
 
 class Table:
     """A TOML table that is read key by key; every complaint names the file and the table.
@@ -31,7 +35,7 @@ class Table:
             if key not in valid:
                 raise ValueError(
                     f"{self.where}: unknown key {key!r}; valid keys are {', '.join(valid)}"
-                    + did_you_mean(key, valid)
+                    + (did_you_mean(key, valid) or _ELSEWHERE.get(key, ""))
                 )
 
     def __contains__(self, key: str) -> bool:

@@ -23,9 +23,3 @@ class Check:
     timestep: float | None = None
     seconds: float = 3.0
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli.checking import _run
-
-        _run.check(self)

@@ -8,13 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from dano.archive import write_text
+from dano.cli import _scenes
 from dano.cli._arguments import Simulate, Train
 from dano.cli._console import say
+from dano.cli._learn import train
 from dano.cli.film._place import Place, read_json, TABLE
 from dano.cli.film._slide import find_slide
 from dano.cli.film._stages import AGAIN, Stage
 from dano.cli.identifying import Identify
+from dano.cli.identifying.run import identify
 from dano.cli.tracking import Track
+from dano.cli.tracking.run import track
 from dano.engine import simulate
 from dano.identification import load_motion, Motion, save_motion
 from dano.scene_file import parse_scene
@@ -87,29 +91,33 @@ def stages_after(place: Place) -> list[Stage]:
 def _learn(place: Place, goes_on: bool) -> None:
     """The solid with its look."""
     asked = place.command
-    Train(
-        place.folder / "masked.json",
-        asked.output,
-        resolution=asked.resolution,
-        iterations=asked.iterations,
-        mass=asked.mass,
-        table=0.0,
-        seed=asked.seed,
-        resume=goes_on,
-    )()
+    train(
+        Train(
+            place.folder / "masked.json",
+            asked.output,
+            resolution=asked.resolution,
+            iterations=asked.iterations,
+            mass=asked.mass,
+            table=0.0,
+            seed=asked.seed,
+            resume=goes_on,
+        )
+    )
 
 
 def _follow(place: Place) -> None:
     """A pose in every frame."""
     asked, folder = place.command, place.folder
-    Track(
-        asked.slide,
-        str(asked.output),
-        folder / "motion.npz",
-        report=folder / "motion.html",
-        body=place.body,
-        filming=place.filming(),
-    )()
+    track(
+        Track(
+            asked.slide,
+            str(asked.output),
+            folder / "motion.npz",
+            report=folder / "motion.html",
+            body=place.body,
+            filming=place.filming(),
+        )
+    )
 
 
 def _fit(place: Place) -> None:
@@ -127,17 +135,19 @@ def _fit(place: Place) -> None:
     say(f"the slide lasts from {shown[part.first]:.2f} to {shown[part.last - 1]:.2f} s of the film")
     duration = part.until - part.since
     write_text(folder / "slide.toml", _scene_text(place, duration, "0.3", ""))
-    Identify(
-        folder / "slide.toml",
-        (folder / "slide.npz",),
-        (f"{place.body},{TABLE}.sliding_friction:{_BOUNDS}",),
-        output=folder / "friction.json",
-        report=folder / "story.html",
-        initial="states",
-        video=asked.slide,
-        look=str(asked.output),
-        filming=place.filming(float(shown[part.first]) - half, float(shown[part.last - 1]) + half),
-    )()
+    identify(
+        Identify(
+            folder / "slide.toml",
+            (folder / "slide.npz",),
+            (f"{place.body},{TABLE}.sliding_friction:{_BOUNDS}",),
+            output=folder / "friction.json",
+            report=folder / "story.html",
+            initial="states",
+            video=asked.slide,
+            look=str(asked.output),
+            filming=place.filming(float(shown[part.first]) - half, float(shown[part.last - 1]) + half),
+        )
+    )
 
 
 def _alike(place: Place, slid: Motion) -> tuple[float, float, float] | None:
@@ -171,12 +181,14 @@ def _simulate(place: Place) -> None:
         folder / "scene.toml",
         f"# Friction {found['values'][name]:.4g}{stated}, from {place.command.slide.name}\n{text}",
     )
-    Simulate(
-        folder / "scene.toml",
-        output=folder / "run.npz",
-        video=folder / "run.mp4",
-        camera="scene",
-    )()
+    _scenes.simulate(
+        Simulate(
+            folder / "scene.toml",
+            output=folder / "run.npz",
+            video=folder / "run.mp4",
+            camera="scene",
+        )
+    )
 
 
 def _lines(start: Mapping[str, Sequence[float] | np.ndarray]) -> str:

@@ -66,9 +66,3 @@ class Film:
     last: Annotated[StageName | None, arg(name="to")] = None
     seed: int = 0
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli.film import _run
-
-        _run.film(self)

@@ -8,7 +8,7 @@ import numpy as np
 from dano.archive import replacing, write_json
 from dano.cli._arguments import Poses
 from dano.cli._console import Progress, put, say
-from dano.cli._learn import look, print_data
+from dano.cli._learn import look, poses, print_data
 from dano.cli.film._place import Place, read_json
 from dano.cli.film._stages import AGAIN, Stage
 from dano.vision import check_slide, check_walk, is_video, read_film, write_frames
@@ -83,16 +83,18 @@ def _cameras(place: Place) -> None:
     still = folder / _STILL
     _write_still(asked.slide, still, progress)
     progress.close()
-    Poses(
-        place.walk,
-        (still,),
-        folder / "cameras.json",
-        masks=asked.masks,
-        marker_size=asked.marker_size,
-        marker_family=asked.marker_family,
-        up="marker",
-        seed=asked.seed,
-    )()
+    poses(
+        Poses(
+            place.walk,
+            (still,),
+            folder / "cameras.json",
+            masks=asked.masks,
+            marker_size=asked.marker_size,
+            marker_family=asked.marker_family,
+            up="marker",
+            seed=asked.seed,
+        )
+    )
     found = read_json(folder / "cameras.json")
     frames = found["frames"]
     own = [frame for frame in frames if Path(frame["file_path"]).name == _STILL]

@@ -13,8 +13,12 @@ from dano.cli.tracking import Filming
 class Identify:
     """Find the parameters of a scene from observed motions of its bodies, with error bars.
 
+    Or mass, centre of mass and inertia of what a robot holds, from a log of its wrist's forces and torques.
+
     Attributes:
-        scene: Scene file (.toml).
+        scene: Scene file (.toml). Or a wrist's log (.csv) with nothing else: time, the sensor's pose (x, y,
+        z,
+            qw, qx, qy, qz), fx, fy, fz [N] and mx, my, mz [N m].
         motions: Observed motions (.npz, .csv, .txt, .tum): times [s], positions [m], quaternions. The guide
             "Identification" lists the columns.
         parameter: Unknown parameters, each as NAME:LOWER:UPPER or NAME:LOWER:UPPER:START, e.g.
@@ -39,6 +43,7 @@ class Identify:
         time_unit: Unit of the times in the files; default: as their columns say, or as their size tells.
         length_unit: Unit of positions and velocities in the files; default likewise.
         timestep: Timestep of the simulation [s]; default: the scene's.
+        frame: Axes of a wrist's forces and torques: of its sensor, or of the world.
         video: The film that the one motion was tracked in: its pixels are fitted through the simulation.
             Needs --look and --camera.
         look: What the body in the film looks like: what `dano train` wrote, or trained_bunny or trained_soap.
@@ -48,8 +53,8 @@ class Identify:
     """
 
     scene: Positional[Path]
-    motions: Positional[tuple[Path, ...]]
-    parameter: Annotated[tuple[str, ...], arg(aliases=["-p"])]
+    motions: Positional[tuple[Path, ...]] = ()
+    parameter: Annotated[tuple[str, ...], arg(aliases=["-p"])] = ()
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
     report: Path | None = None
     body: str | None = None
@@ -67,14 +72,9 @@ class Identify:
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     length_unit: Literal["m", "cm", "mm"] | None = None
     timestep: float | None = None
+    frame: Literal["sensor", "world"] = "sensor"
     video: Path | None = None
     look: str | None = None
     filming: OmitArgPrefixes[Filming] = Filming()
     resume: bool = False
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli.identifying import _run
-
-        _run.identify(self)

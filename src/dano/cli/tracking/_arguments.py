@@ -87,9 +87,3 @@ class Track:
     start: tuple[float, float, float, float, float, float, float] | None = None
     filming: OmitArgPrefixes[Filming] = Filming()
     json: bool = False
-
-    def __call__(self) -> None:
-        """Run the command."""
-        from dano.cli.tracking import _run
-
-        _run.track(self)

@@ -19,8 +19,8 @@ from dano.cli._arguments import Train
 from dano.cli._console import Progress, put, put_json
 from dano.cli._learn import train
 from dano.cli.tracking._arguments import Filming, Track
-from dano.cli.tracking._run import track
 from dano.cli.tracking.filming import camera_of, filmed, options_of
+from dano.cli.tracking.run import track
 from dano.identification import load_motion
 from dano.objects import NeuralObject
 from dano.pixels import FilmFit, identify_in_film

@@ -238,11 +238,13 @@ def impact_of(
         alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
             they meet; between two that move, this would not conserve angular momentum.
     """
-    impact = no_impact(pair.impact_depth, pair.deepest, material.timestep)
+    impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, material.timestep)
     if patch.load > ZERO:
         impact.share = share_of_impact(patch, material.bounce)
         if impact.share > ZERO and found.hits > 0:
-            impact.stiffness = stiffness_of_impact(a, b, patch, material.bounce, material.timestep)
+            impact.stiffness = stiffness_of_impact(
+                a, b, patch, material.bounce, pair.factor, material.timestep
+            )
             delays = wp.where(alone, impact.share, ZERO)
             impact = delayed(impact, delays, found.share, material.timestep)
     return impact
@@ -387,7 +389,7 @@ def find_pair(
             )  # fmt: skip
         found.patch = patch
         found.com_difference = pose.com_difference
-        found.impact = no_impact(pair.impact_depth, pair.deepest, h)
+        found.impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, h)
         if not lasts:
             found.impact = impact_of(a, b, patch, material, found, pair, alone)
         if not lasts and found.impact.share == ZERO:

@@ -77,6 +77,7 @@ class SamplePair:
         follows: 1 where points follow the second body, which rolls on the first, else 0.
         sink: Depth up to which predicted geometry is taken [m].
         impact_depth: δ, depth of an impact [m].
+        factor: F of its damper, see `dano.physics.impacts.Impact` [1].
         deepest: Depth that no part gets beyond within a step with an impact of another part [m].
         margin: Distance within which samples count as near [m].
     """
@@ -85,6 +86,7 @@ class SamplePair:
     follows: real
     sink: real
     impact_depth: real
+    factor: real
     deepest: real
     margin: real
 

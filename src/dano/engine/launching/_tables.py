@@ -30,6 +30,9 @@ _MARGIN = 0.001
 _SINK = 0.01
 # … and by this share of the thinner one's half thickness. Impacts are at most as deep.
 _THIN = 0.25
+# Momentum that the damper of an impact passes on, see `dano.physics.impacts.Impact`: half the size over the
+# depth of the impact, within bounds. Where that is shallow, what has sunk in has to stop all of what comes.
+_SOFTEST, _HARDEST = 100.0, 1e4
 # Another part of a body, whose impact is left to the next step, gets in by at most this share of the size.
 _DEEPEST = 0.04
 _STRUCTURES = "dano.engine.kernels.tables"
@@ -272,19 +275,21 @@ def _pairs(
     """Rows of the pairs whose first body's samples press on the second's solid, and their whole numbers."""
     dtype, h = extents.dtype, scene.timestep
     if not pairs:
-        return jnp.zeros((0, 6), dtype), np.zeros((0, 3), np.int32)
+        return jnp.zeros((0, 7), dtype), np.zeros((0, 3), np.int32)
     both = {(first, second) for first, second, _ in pairs}
     first, second, contact = (np.array(x) for x in zip(*pairs, strict=True))
     size, thickness = jnp.minimum(extents[first, 4:], extents[second, 4:]).T
     smooth = [body.surface is not None and body.surface.turning != "fixed" for body in bodies]
     gravity_step = jnp.sqrt(jnp.sum(scene.gravity**2)) * h * h
+    depths = _impact_depths(scene, dtype)[contact]
     rows = packed(
         features,
         "SamplePair",
         share=jnp.asarray([0.5 if (j, i) in both else 1.0 for i, j, _ in pairs], dtype),
         follows=jnp.asarray([float(smooth[j] and not smooth[i]) for i, j, _ in pairs], dtype),
         sink=jnp.minimum(_SINK * size, _THIN * thickness),
-        impact_depth=jnp.minimum(_impact_depths(scene, dtype)[contact], _THIN * thickness),
+        impact_depth=jnp.minimum(depths, _THIN * thickness),
+        factor=jnp.clip(0.5 * size / depths, _SOFTEST, _HARDEST),
         deepest=jnp.minimum(_DEEPEST * size, _THIN * thickness),
         margin=_MARGIN * size + 2 * gravity_step.astype(dtype),
     )

@@ -91,6 +91,8 @@ def read_mesh(
     stated = getattr(mesh, "units", None)
     if isinstance(mesh, trimesh.Scene):
         mesh = mesh.to_mesh()
+    if not own and isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) == 0:
+        raise ValueError(f"{name} must be a triangle mesh, got no whole triangle: is it cut off?")
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"{name} must be a triangle mesh with faces, or its file, got {shown(mesh)}")
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)

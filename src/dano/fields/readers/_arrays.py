@@ -1,5 +1,6 @@
 """Grids in NumPy's files: densities, signed distances, and the grid inside a neural object."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,11 @@ def load_npy(
     except (OSError, ValueError) as error:
         expected = "voxels (nx, ny, nz) of booleans, integers or floats"
         raise ValueError(f"{path}: expected {expected}; {error}") from error
+    if spacing is None:
+        warnings.warn(
+            f"{path}: no spacing was given: the longest side of the grid is taken as 1 m; give spacing [m]",
+            stacklevel=3,
+        )
     step = np.asarray(checked_spacing(1 / max(values.shape) if spacing is None else spacing))
     if origin is None:
         origin = -0.5 * step * (np.asarray(values.shape) - 1)

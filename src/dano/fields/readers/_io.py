@@ -1,6 +1,5 @@
 """Reading fields from files of many kinds, and writing grids."""
 
-import importlib
 import re
 from collections.abc import Callable
 from importlib.resources import as_file, files
@@ -69,11 +68,22 @@ _READERS: dict[str, _Reader] = {
 }
 
 
-_MODELS = {"dano-osf": "OSF", "dano-hash-model": "HashModel", "dano-learned-field": "LearnedField"}
-"""Classes of `dano.vision` by the format of their files. By name, because `vision` lies above `fields`: it is
-imported only when such a file is read."""
+MODEL_FORMATS = ("dano-osf", "dano-hash-model", "dano-learned-field")
+"""Formats of files of what was learned from photographs."""
 
-FIELD_FORMATS = FIELD[0], *_MODELS
+_model_readers: list[Callable[[Path], Any]] = []
+
+
+def offer_models(read: Callable[[Path], Any]) -> None:
+    """Say what reads a file of `MODEL_FORMATS`: `dano.vision`, of which fields know nothing.
+
+    Args:
+        read: Gives a field, or something with a method `field`.
+    """
+    _model_readers[:] = [read]
+
+
+FIELD_FORMATS = FIELD[0], *MODEL_FORMATS
 """What files of dano that `load_field` reads say that they hold."""
 
 FIELD_SUFFIXES = tuple(_READERS)
@@ -191,9 +201,9 @@ def _of_unit(path: str | Path, crop: np.ndarray | None, options: dict[str, Any])
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "no such file"
         raise ValueError(f"{path}: {what}; expected a field ({', '.join(_READERS)})")
-    if suffix == ".npz" and (form := format_of(path)) in _MODELS:
+    if suffix == ".npz" and (form := format_of(path)) in MODEL_FORMATS:
         _check_options(path, f"{form} file", options, ())
-        return _of_model(path, _MODELS[form], crop)
+        return _of_model(path, crop)
     reader = _SPLATS if suffix == ".ply" else _READERS[suffix]
     _check_options(path, f"{suffix} file", options, reader.options)
     if reader.crops:
@@ -202,11 +212,12 @@ def _of_unit(path: str | Path, crop: np.ndarray | None, options: dict[str, Any])
     return field if crop is None else _cropped(field, crop, path)
 
 
-def _of_model(path: Path, name: str, crop: np.ndarray | None) -> AbstractField:
-    """The density of a model of `dano.vision` that was saved."""
+def _of_model(path: Path, crop: np.ndarray | None) -> AbstractField:
+    """The density of a model that was learned from photographs."""
+    (read,) = _model_readers
+    model = read(path)
     if crop is not None:
-        raise ValueError(f"{path}: {name} has a box of its own, got crop {crop.tolist()}")
-    model = getattr(importlib.import_module("dano.vision"), name).load(path)
+        raise ValueError(f"{path}: {type(model).__name__} has a box of its own, got crop {crop.tolist()}")
     return model if isinstance(model, AbstractField) else model.field()
 
 

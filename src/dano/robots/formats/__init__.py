@@ -21,6 +21,7 @@ from dano.robots.formats._lacking import (
     EQUALITIES as EQUALITIES,
     GRAVCOMP as GRAVCOMP,
     IGNORABLE as IGNORABLE,
+    MASSES as MASSES,
     WEIGHTLESS as WEIGHTLESS,
 )
 from dano.robots.formats._mjcf import read_mjcf as read_mjcf

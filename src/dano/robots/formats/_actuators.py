@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dano.robots.formats._description import Drive, Lacking
+from dano.robots.formats._tendons import shares_of
 
 ALL, OTHER = "actuators", "other actuators"
 """Names by which all of them are left out, or those that dano has no counterpart of."""
@@ -59,12 +60,7 @@ def _shares(model: Any, mujoco: Any, i: int) -> dict[int, float] | None:
     """Shares of joints in the length of a fixed tendon that an actuator pulls; None for none."""
     if int(model.actuator_trntype[i]) != int(mujoco.mjtTrn.mjTRN_TENDON):
         return None
-    tendon = int(model.actuator_trnid[i][0])
-    first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
-    rows = range(first, first + count)
-    if any(int(model.wrap_type[k]) != int(mujoco.mjtWrap.mjWRAP_JOINT) for k in rows):
-        return None
-    return {int(model.wrap_objid[k]): float(model.wrap_prm[k]) for k in rows}
+    return shares_of(model, mujoco, int(model.actuator_trnid[i][0]))
 
 
 def _disabled(model: Any, mujoco: Any, flag: str) -> bool:

@@ -335,10 +335,10 @@ def without_followers(joints: list[Connection], at: dict[str, float]) -> list[Co
 
     Args:
         joints: All joints.
-        at: Coordinates of those that are welds although they could move [rad or m].
+        at: Coordinates of those that are welds although they could move [rad or m]; it gets those that follow
+            them, too.
     """
-    joints, at = list(joints), dict(at)
-    held = True
+    joints, held = list(joints), True
     while held:
         held = False
         for row, joint in enumerate(joints):

@@ -16,6 +16,9 @@ EQUALITIES = "equalities"
 WEIGHTLESS = "weightless joints"
 """Name of joints that move nothing with mass."""
 
+MASSES = "masses"
+"""Name of all masses: what is left of a robot serves kinematics."""
+
 IGNORABLE = {
     "adhesion": "surfaces that stick",
     "surface velocity": "surfaces that move, such as belts",
@@ -27,6 +30,7 @@ IGNORABLE = {
     "fluid": "drag by density and viscosity",
     "free joints": "damping, friction, armature and springs of free joints",
     GRAVCOMP: "compensated weight of bodies",
+    MASSES: "all masses and inertias: the robot serves kinematics alone",
     "height fields": "shapes that are height fields or signed distances",
     "mimics of nothing": "joints that mimic one which does not exist",
     "nonlinear springs": "springs and dampers that are not linear",
@@ -68,9 +72,6 @@ def lacking_of(model: Any, mujoco: Any) -> list[Lacking]:
         if np.ptp(model.body_gravcomp[welded]) > 0 if welded.size else False:
             names = _listed([model.body(i).name or f"body {i}" for i in welded])
             say(GRAVCOMP, f"gravcomp of {names} differs: to dano what is welded together is one body")
-    acting = [name for t in range(model.ntendon) if (name := _acting_tendon(model, t))]
-    if acting:
-        say("tendons", f"{_listed(acting)}: dano has no tendons")
     if model.nflex:
         say("soft bodies", f"{model.nflex} flexes: dano has rigid bodies only")
     found += _of_joints(model, mujoco) + _of_geoms(model, mujoco) + _of_surfaces(model)
@@ -127,14 +128,6 @@ def notes_of(model: Any) -> list[str]:
     return [f"{_listed(moved)} is moved by mocap in MuJoCo: here it stands still"] if moved else []
 
 
-def _acting_tendon(model: Any, t: int) -> str | None:
-    """Name of a tendon that pulls, rubs, weighs or stops by itself; what pulls on it counts elsewhere."""
-    laws = ("limited", "stiffness", "damping", "frictionloss", "armature", "actfrclimited")
-    if any(np.any(getattr(model, f"tendon_{law}", np.zeros((t + 1, 1)))[t]) for law in laws):
-        return model.tendon(t).name or f"tendon {t}"
-    return None
-
-
 def _of_joints(model: Any, mujoco: Any) -> list[Lacking]:
     found, types = [], mujoco.mjtJoint
     free, ball = int(types.mjJNT_FREE), int(types.mjJNT_BALL)
@@ -142,17 +135,6 @@ def _of_joints(model: Any, mujoco: Any) -> list[Lacking]:
         kind, name = int(model.jnt_type[j]), model.joint(j).name or f"joint {j}"
         first = int(model.jnt_dofadr[j])
         dofs = slice(first, first + {free: 6, ball: 3}.get(kind, 1))
-        if kind == free:
-            laws = {
-                "damping": model.dof_damping[dofs],
-                "frictionloss": model.dof_frictionloss[dofs],
-                "armature": model.dof_armature[dofs],
-                "stiffness": model.jnt_stiffness[j],
-            }
-            given = [key for key, value in laws.items() if np.any(value)]
-            if given:
-                text = f"the free joint {name!r} has {' and '.join(given)}: dano's free bodies have none"
-                found.append(Lacking("free joints", text))
         if kind == ball and model.jnt_limited[j]:
             text = f"the ball joint {name!r} has a range: dano's ball joints have none"
             found.append(Lacking("ball limits", text))

@@ -16,7 +16,6 @@ from dano.robots.formats._description import (
     displaced,
     held_at,
     Lacking,
-    led_by,
     Link,
     Placed,
     Solid,
@@ -25,6 +24,7 @@ from dano.robots.formats._description import (
 )
 from dano.robots.formats._keyframes import keyframes_of
 from dano.robots.formats._lacking import EQUALITIES, lacking_of, notes_of, silent_of
+from dano.robots.formats._tendons import length_of, Tendons, with_loads_of_followers, within
 from dano.robots.formats._touching import meets_of, touching_geoms
 
 _WORLD = "world"
@@ -70,6 +70,7 @@ class _Reader:
         self.bodies = self.unique([model.body(i).name or f"body {i}" for i in range(1, model.nbody)])
         self.joints = self.unique([self.joint_name(j) for j in range(model.njnt)])
         self.lacking = [*lacking_of(model, mujoco), *self.undriven]
+        self.held: dict[str, float] = {}
         self.touching = touching_geoms(model)
         self.owners = [self.name(int(body)) for body in model.geom_bodyid]
 
@@ -94,7 +95,7 @@ class _Reader:
             links += [Link(joint.child) for joint in chain[:-1]]
             links.append(self.link(i))
             joints += chain
-        joints = self.driven(self.followed(joints))
+        joints = self.driven(self.tied(joints))
         meets, parted = meets_of(model, self.mujoco, self.owners)
         x, y, z = (0.0, 0.0, 0.0) if self.off("GRAVITY") else map(float, model.opt.gravity)
         ties = () if self.off("EQUALITY") else tuple(self.ties())
@@ -207,8 +208,14 @@ class _Reader:
             int(types.mjJNT_HINGE): "hinge",
         }
         kind, dof = kinds[int(model.jnt_type[j])], int(model.jnt_dofadr[j])
+        laws: dict[str, Any] = {
+            "damping": 0.0 if self.off("DAMPER") else float(model.dof_damping[dof]),
+            "friction": 0.0 if self.off("FRICTIONLOSS") else float(model.dof_frictionloss[dof]),
+            "armature": float(model.dof_armature[dof]),
+            "stiffness": 0.0 if self.off("SPRING") else float(np.ravel(model.jnt_stiffness[j])[0]),
+        }
         if kind == "floating":
-            return Connection(self.joints[j], kind, parent, child, place)
+            return Connection(self.joints[j], kind, parent, child, place, **laws)
         single = kind in ("hinge", "slide")
         limited = single and bool(model.jnt_limited[j]) and not self.off("LIMIT")
         least, most = map(float, model.jnt_actfrcrange[j])
@@ -224,10 +231,7 @@ class _Reader:
             tuple(map(float, model.jnt_pos[j])),
             limits=(float(model.jnt_range[j][0]), float(model.jnt_range[j][1])) if limited else None,
             efforts=efforts,
-            damping=0.0 if self.off("DAMPER") else float(model.dof_damping[dof]),
-            friction=0.0 if self.off("FRICTIONLOSS") else float(model.dof_frictionloss[dof]),
-            armature=float(model.dof_armature[dof]),
-            stiffness=0.0 if self.off("SPRING") else float(np.ravel(model.jnt_stiffness[j])[0]),
+            **laws,
             rest=float(model.qpos_spring[address]) if single else 0.0,
             home=float(model.qpos0[address]) if single else 0.0,
             drive=self.drives.get(j),
@@ -237,6 +241,15 @@ class _Reader:
         # The file shows the pose at q = ref; a joint says where its child is at q = 0.
         return dataclasses.replace(found, place=displaced(found, -found.home))
 
+    def tied(self, joints: list[Connection]) -> list[Connection]:
+        """The joints with what equalities and fixed tendons do to them."""
+        tendons = Tendons(self.model, self.mujoco, self.joints, self.off)
+        joints = tendons.coupled(self.followed(joints), self.held)
+        joints, crossed = with_loads_of_followers(joints)
+        joints = tendons.acting(joints, self.held)
+        self.lacking += [*tendons.lacking, *crossed]
+        return joints
+
     def followed(self, joints: list[Connection]) -> list[Connection]:
         """The joints with what equalities say of them: they follow others, or stay where they are."""
         model = self.model
@@ -244,7 +257,7 @@ class _Reader:
             return joints
         rows = {joint.name: row for row, joint in enumerate(joints)}
         homes = {joint.name: joint.home for joint in joints}
-        joints, done, held = list(joints), set(), {}
+        joints, done = list(joints), set()
         for e in range(model.neq):
             if int(model.eq_type[e]) != int(self.mujoco.mjtEq.mjEQ_JOINT) or not model.eq_active0[e]:
                 continue
@@ -259,12 +272,12 @@ class _Reader:
             done.add(name)
             # Polynomials are of the distances from the pose of the file.
             if leader < 0:
-                held[name] = homes[name] + shift
-                joints[row] = held_at(joints[row], held[name])
+                self.held[name] = homes[name] + shift
+                joints[row] = held_at(joints[row], self.held[name])
                 continue
             shift += homes[name] - ratio * homes[self.joints[leader]]
             joints[row] = dataclasses.replace(joints[row], mimics=(self.joints[leader], ratio, shift))
-        return without_followers(joints, held)
+        return without_followers(joints, self.held)
 
     def driven(self, joints: list[Connection]) -> list[Connection]:
         """The joints with the drives of tendons, and of those that follow, on the joint that leads them."""
@@ -272,19 +285,21 @@ class _Reader:
         joints, pulls = list(joints), list(self.pulls)
         for row, joint in enumerate(joints):
             if joint.drive is not None and joint.mimics is not None:
-                pulls.append(Pull(joint.drive, {self.joints.index(joint.name): 1.0}))
+                # What the joint lets through of it stays with the drive.
+                ends = sorted(effort / joint.drive.gear for effort in joint.efforts)
+                limits = within(joint.drive.limits, (ends[0], ends[1]))
+                drive = joint.drive if limits is None else dataclasses.replace(joint.drive, limits=limits)
+                pulls.append(Pull(drive, {self.joints.index(joint.name): 1.0}))
                 joints[row] = dataclasses.replace(joint, drive=None)
         for drive, shares in pulls:
-            leaders, ratio, shift = set(), 0.0, 0.0
-            for j, share in shares.items():
-                name, times, plus = led_by(joints, self.joints[j])
-                leaders.add(name)
-                ratio, shift = ratio + share * times, shift + share * plus
-            leader = joints[rows[leaders.pop()]] if len(leaders) == 1 else None
+            ratios, shift = length_of({self.joints[j]: x for j, x in shares.items()}, joints, self.held)
+            name, ratio = next(iter(ratios.items()), ("", 0.0))
+            leader = joints[rows[name]] if len(ratios) == 1 else None
             why = None
             if leader is None:
-                why = "several joints, of which none leads the others"
-            elif leader.kind not in ("hinge", "slide") or ratio == 0:
+                several = "several joints, of which none leads the others"
+                why = several if ratios else "joints that do not move"
+            elif leader.kind not in ("hinge", "slide"):
                 why = "joints that do not move"
             elif leader.drive is not None:
                 why = f"joint {leader.name!r}, which {leader.drive.name!r} drives already"
@@ -302,14 +317,15 @@ class _Reader:
         """What `connect` and `weld` hold together."""
         model, types = self.model, self.mujoco.mjtEq
         kinds = {int(types.mjEQ_CONNECT): "point", int(types.mjEQ_WELD): "weld"}
+        scalar = {int(types.mjEQ_JOINT), int(types.mjEQ_TENDON)}
         found = []
         for e in range(model.neq):
-            if not model.eq_active0[e] or int(model.eq_type[e]) == int(types.mjEQ_JOINT):
+            if not model.eq_active0[e] or int(model.eq_type[e]) in scalar:
                 continue
             kind = kinds.get(int(model.eq_type[e]))
             if kind is None:
                 name = model.equality(e).name or f"equality {e}"
-                text = f"{name!r} ties tendons or soft bodies: dano ties joints and bodies"
+                text = f"{name!r} ties soft bodies: dano ties joints and bodies"
                 self.lacking.append(Lacking(EQUALITIES, text))
                 continue
             ends = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])

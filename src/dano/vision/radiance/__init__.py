@@ -1,6 +1,7 @@
 """What a photograph is explained by: radiance models, volume rendering, the field that is learned."""
 
 from dano.vision.radiance._appearance import Appearance as Appearance, Network as Network, Share as Share
+from dano.vision.radiance._files import model_of_file as model_of_file
 from dano.vision.radiance._hash_model import HashModel as HashModel
 from dano.vision.radiance._learned import LearnedField as LearnedField
 from dano.vision.radiance._models import (

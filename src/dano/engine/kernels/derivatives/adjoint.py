@@ -259,12 +259,19 @@ def impact_patch_work(
 
 @wp.func
 def impact_work(
-    first: BodyState, second: BodyState, patch: Patch, bounce: real, h: real, hits: bool, bar: Impact
+    first: BodyState,
+    second: BodyState,
+    patch: Patch,
+    bounce: real,
+    factor: real,
+    h: real,
+    hits: bool,
+    bar: Impact,
 ) -> real:
     """⟨bar, share and stiffness of an impact⟩."""
     work = bar.share * share_of_impact(patch, bounce)
     if hits:
-        work += bar.stiffness * stiffness_of_impact(first, second, patch, bounce, h)
+        work += bar.stiffness * stiffness_of_impact(first, second, patch, bounce, factor, h)
     return work
 
 

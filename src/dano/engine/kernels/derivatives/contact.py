@@ -61,6 +61,7 @@ class PairBar:
         timestep: By h.
         sink: By the depth up to which predicted geometry is taken.
         impact_depth: By δ.
+        factor: By F.
         deepest: By the depth that another part may have.
         twists: By twists and virtual twists, of bodies on joints.
     """
@@ -71,6 +72,7 @@ class PairBar:
     timestep: real
     sink: real
     impact_depth: real
+    factor: real
     deepest: real
     twists: Virtual
 
@@ -211,6 +213,7 @@ def pull_points(
             impact_bar.share += by_impact.share
             impact_bar.stiffness += by_impact.stiffness
             impact_bar.depth += by_impact.depth
+            impact_bar.factor += by_impact.factor
             impact_bar.deepest += by_impact.deepest
             impact_bar.delays += by_impact.delays
             impact_bar.way += by_impact.way
@@ -433,6 +436,7 @@ def pull_pair(
     by_first = BodyState()
     by_second = BodyState()
     impact_bar.depth = total(impact_bar.depth)
+    impact_bar.factor = total(impact_bar.factor)
     impact_bar.deepest = total(impact_bar.deepest)
     if found.impact.share > ZERO:
         impact_bar.share = total(impact_bar.share)
@@ -453,9 +457,10 @@ def pull_pair(
         else:
             h_bar += impact_bar.rest
         bounce = scene.materials[world, index.contact].bounce
-        by_first, by_second, patch_bar, by_bounce, by_h, _a, _b = wp.grad(impact_work)(
-            a, b, found.patch, bounce, h, hits, impact_bar
+        by_first, by_second, patch_bar, by_bounce, by_factor, by_h, _a, _b = wp.grad(impact_work)(
+            a, b, found.patch, bounce, pair.factor, h, hits, impact_bar
         )
+        impact_bar.factor += by_factor
         by_pose, by_share, by_h_of_patch, by_depth = pull_patch_of_impact(
             scene, room, bars, world, lane, found, pose, patch_bar
         )
@@ -476,6 +481,7 @@ def pull_pair(
         bar.first = summed_body(bar.first, by_first)
         bar.second = summed_body(bar.second, by_second)
         bar.impact_depth += impact_bar.depth
+        bar.factor += impact_bar.factor
         bar.deepest += impact_bar.deepest
         bar.first = falling_bar(bar.first, found.falls)
         bar.second = falling_bar(bar.second, found.falls)

@@ -95,6 +95,7 @@ def pull_touching(
     if found.pair < bars.pairs.shape[1]:
         bars.pairs[world, found.pair].sink += bar.sink
         bars.pairs[world, found.pair].impact_depth += bar.impact_depth
+        bars.pairs[world, found.pair].factor += bar.factor
         bars.pairs[world, found.pair].deepest += bar.deepest
 
 

@@ -13,6 +13,7 @@ from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
 from dano.cli.identifying._arguments import Identify
+from dano.cli.identifying._load import identify_held, LOGS
 from dano.identification import (
     Errors,
     Identification,
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 def identify(command: Identify) -> None:
     """See `dano identify --help`."""
+    if command.scene.suffix.lower() in LOGS:
+        return identify_held(command)
     kept = _checked(command)
     fit_pixels = None
     if command.video is not None:
@@ -106,6 +109,10 @@ def _checked(command: Identify) -> Path | None:
         raise ImportError(missing)
     if not command.motions:
         raise ValueError("motions must name at least one file, got none")
+    if not command.parameter:
+        raise ValueError("parameter must name at least one unknown: -p soap,table.sliding_friction:0:1")
+    if command.frame != "sensor":
+        raise ValueError("frame is that of a wrist's forces and torques, got a scene")
     if command.video is None and command.look is not None:
         raise ValueError("look says how the body in a film looks: give --video, too")
     if output is None:

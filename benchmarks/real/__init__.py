@@ -1,0 +1,1 @@
+"""Real recordings: how well dano predicts what was measured, beside what others predict."""

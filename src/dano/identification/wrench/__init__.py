@@ -1,0 +1,4 @@
+"""What a robot holds, from what its wrist feels: mass, centre and inertia from forces and torques."""
+
+from dano.identification.wrench._fit import identify_load as identify_load, Load as Load
+from dano.identification.wrench._log import load_wrist_log as load_wrist_log, WristLog as WristLog
