@@ -103,11 +103,11 @@ def _check_folder_options(command: Import, splats: bool) -> None:
 
 def _write_folder(command: Import, field: GridField, pose: Pose | None) -> None:
     """An object of splats for other simulators, with the splats themselves."""
-    weight = {"mass_scale": _WATER} if command.mass is None else {"mass": command.mass}
-    progress = Progress()
-    made = build_object(
-        field, BuildOptions(mass_model="solid", **weight), weighed=True, dashes="--", progress=progress
+    options = BuildOptions(
+        mass_model="solid", mass=command.mass, mass_scale=_WATER if command.mass is None else None
     )
+    progress = Progress()
+    made = build_object(field, options, weighed=True, dashes="--", progress=progress)
     splats = read_splats(command.file, skip_nan=command.skip_nan)
     inside = splats.inside(command.box, command.sphere)
     unit = (command.scale or 1.0) if command.units is None else UNITS[command.units]

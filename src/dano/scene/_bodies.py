@@ -48,14 +48,8 @@ LAYER = 0.02
 
 # Quantities of a start, and how many numbers each has; of joints as many as they have coordinates.
 _START = {
-    "position": 3,
-    "origin": 3,
-    "orientation": 4,
-    "velocity": 3,
-    "omega": 3,
-    "spin_world": 3,
-    "q": None,
-    "v": None,
+    **{"position": 3, "origin": 3, "orientation": 4, "velocity": 3, "omega": 3, "spin_world": 3},
+    **{"q": None, "v": None},
 }
 _ARGUMENTS = (
     *_START,
