@@ -12,34 +12,25 @@ Up = Literal["y", "z"]
 
 @dataclasses.dataclass(frozen=True)
 class BuildOptions:
-    """How to make a neural object of a density field.
+    """How to make a neural object of a density field."""
 
-    Attributes:
-        samples: Number of contact samples.
-        density_range: Lower and upper density of the samples; default: around the field's own surface.
-        mass_model: solid: uniform inside the surface, hollow cores filled. density: as dense as the field.
-            auto: density where it is the occupancy of a solid inside, else solid.
-        mass_scale: Mass per unit of density and cubic metre [kg]; default 1.
-        mass: Total mass [kg], instead of the mass scale.
-        resolution: Cells along the longest axis for mass integrals and sampling.
-        units: Unit of the lengths in the file; default: as meshes say or their size tells, else metres.
-        up: Axis of a mesh's file that points up: it is turned so that z does; default: y in glTF, else z.
-        length: Scale the field so that the object's longest extent is this [m].
-        floaters: Parts that are separate from the largest one feel contact, too; those of meshes always do.
-        seed: Seed of the random samples.
-    """
-
-    samples: int = 5000
+    samples: int = 5000  # Number of contact samples
+    # Lower and upper density of the samples; default: around the field's own surface.
     density_range: tuple[float, float] | None = None
+    # solid: uniform inside the surface, hollow cores filled. density: as dense as the field. auto: density
+    # where it is the occupancy of a solid inside, else solid.
     mass_model: MassModel = "auto"
-    mass_scale: float | None = None
-    mass: float | None = None
-    resolution: int = 96
+    mass_scale: float | None = None  # Mass per unit of density and cubic metre [kg]; default 1
+    mass: float | None = None  # Total mass [kg], instead of the mass scale
+    resolution: int = 96  # Cells along the longest axis for mass integrals and sampling
+    # Unit of the lengths in the file; default: as meshes say or their size tells, else metres.
     units: Units | None = None
+    # Axis of a mesh's file that points up: it is turned so that z does; default: y in glTF, else z.
     up: Up | None = None
-    length: float | None = None
+    length: float | None = None  # Scale the field so that the object's longest extent is this [m]
+    # Parts that are separate from the largest one feel contact, too; those of meshes always do.
     floaters: bool = False
-    seed: int = 0
+    seed: int = 0  # Seed of the random samples
 
     @property
     def of_file(self) -> dict[str, Any]:

@@ -45,17 +45,11 @@ _ABANDONED = 3600.0
 
 
 class Entry(NamedTuple):
-    """Something that is kept.
+    """Something that is kept."""
 
-    Attributes:
-        paths: Its files or folders.
-        size: Of all of them [bytes].
-        used: When it was made or used last [s since 1970].
-    """
-
-    paths: tuple[Path, ...]
-    size: int
-    used: float
+    paths: tuple[Path, ...]  # Its files or folders
+    size: int  # Of all of them [bytes]
+    used: float  # When it was made or used last [s since 1970]
 
 
 def cache_folder() -> Path | None:

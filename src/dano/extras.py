@@ -32,17 +32,11 @@ def optional(module: str, need: str, extra: str) -> Any:
 
 
 class Package(NamedTuple):
-    """An optional package that several places need.
+    """An optional package that several places need."""
 
-    Attributes:
-        module: Its name.
-        need: What needs it, in words.
-        extra: The extra of dano that installs it.
-    """
-
-    module: str
-    need: str
-    extra: str
+    module: str  # Its name
+    need: str  # What needs it, in words
+    extra: str  # The extra of dano that installs it
 
     def load(self) -> Any:
         """Import it.

@@ -55,26 +55,16 @@ class Line(NamedTuple):
 
     Slopes are changes of the function by changes of the coordinate along the direction; for a coordinate by
     itself in its own unit.
-
-    Attributes:
-        label: Which direction.
-        at: Distances from the point, in units of the scale, shape (n,).
-        values: Of the function there.
-        derivative: At the point.
-        slopes: Central differences over each of the steps, largest step first.
-        roughness: Root of the mean square by which the values miss a cubic.
-        range: Largest value less the smallest one.
-        verdict: What the derivative is worth.
     """
 
-    label: str
-    at: np.ndarray
-    values: np.ndarray
-    derivative: float
-    slopes: tuple[float, ...]
-    roughness: float
-    range: float
-    verdict: Verdict
+    label: str  # Which direction
+    at: np.ndarray  # Distances from the point, in units of the scale, shape (n,)
+    values: np.ndarray  # Of the function there
+    derivative: float  # At the point
+    slopes: tuple[float, ...]  # Central differences over each of the steps, largest step first
+    roughness: float  # Root of the mean square by which the values miss a cubic
+    range: float  # Largest value less the smallest one
+    verdict: Verdict  # What the derivative is worth
 
 
 class Check(NamedTuple):

@@ -23,19 +23,12 @@ from dano.vision import (
 
 
 class LearnedObject(NamedTuple):
-    """What photographs taught of an object.
+    """What photographs taught of an object."""
 
-    Attributes:
-        made: The object.
-        trained: The field that it was made of, with scores and warnings.
-        grid: The field baked.
-        masks_given: Whether the photographs came with masks.
-    """
-
-    made: NeuralObject
-    trained: Trained
-    grid: GridField
-    masks_given: bool
+    made: NeuralObject  # The object
+    trained: Trained  # The field that it was made of, with scores and warnings
+    grid: GridField  # The field baked
+    masks_given: bool  # Whether the photographs came with masks
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the object with its look to a .dano file, as `dano train` does.

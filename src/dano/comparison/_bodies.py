@@ -16,20 +16,13 @@ GRAVITY = 9.81
 
 
 class Rigid(NamedTuple):
-    """A body as mesh engines take it, in the field frame.
+    """A body as mesh engines take it, in the field frame."""
 
-    Attributes:
-        pieces: Convex solids that touch.
-        mass: [kg].
-        com: Centre of mass [m, F], shape (3,).
-        inertia: About it [kg m²], shape (3, 3).
-        surface: A mesh whose signed distance touches instead of the pieces, where the engine can do that.
-    """
-
-    pieces: list[Triangles]
-    mass: float
-    com: Float[np.ndarray, "3"]
-    inertia: Float[np.ndarray, "3 3"]
+    pieces: list[Triangles]  # Convex solids that touch
+    mass: float  # [kg]
+    com: Float[np.ndarray, "3"]  # Centre of mass [m, F], shape (3,)
+    inertia: Float[np.ndarray, "3 3"]  # About it [kg m²], shape (3, 3)
+    # A mesh whose signed distance touches instead of the pieces, where the engine can do that.
     surface: Triangles | None = None
 
 
@@ -48,19 +41,12 @@ class Start(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Where the field frame of a body was.
+    """Where the field frame of a body was."""
 
-    Attributes:
-        origin: [m, W], shape (steps + 1, 3).
-        rotation: F → W, shape (steps + 1, 3, 3).
-        step_time: Time that a step at rest takes [s].
-        unsolved: Steps whose equations the engine says it did not solve.
-    """
-
-    origin: Float[np.ndarray, "n 3"]
-    rotation: Float[np.ndarray, "n 3 3"]
-    step_time: float
-    unsolved: int = 0
+    origin: Float[np.ndarray, "n 3"]  # [m, W], shape (steps + 1, 3)
+    rotation: Float[np.ndarray, "n 3 3"]  # F → W, shape (steps + 1, 3, 3)
+    step_time: float  # Time that a step at rest takes [s]
+    unsolved: int = 0  # Steps whose equations the engine says it did not solve
 
     def of(self, points: Float[np.ndarray, "k 3"], until: int | None = None) -> Float[np.ndarray, "n k 3"]:
         """Points of the body [m, F] over time [m, W], over the first `until` steps."""
@@ -87,16 +73,11 @@ class Solid(NamedTuple):
 
 
 class Probes(NamedTuple):
-    """Spheres near a solid.
+    """Spheres near a solid."""
 
-    Attributes:
-        centres: [m, F], shape (n, 3).
-        radius: [m].
-        clearance: Between each and the solid [m], negative where it goes in, shape (n,).
-    """
-
-    centres: Float[np.ndarray, "n 3"]
-    radius: float
+    centres: Float[np.ndarray, "n 3"]  # [m, F], shape (n, 3)
+    radius: float  # [m]
+    # Between each and the solid [m], negative where it goes in, shape (n,).
     clearance: Float[np.ndarray, " n"]
 
     def judged(self, touching: Bool[np.ndarray, " n"], least: float) -> tuple[float, float, float]:

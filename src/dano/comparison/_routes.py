@@ -26,17 +26,11 @@ _COARSE = 20_000
 
 
 class Grid(NamedTuple):
-    """Densities at the nodes of a grid.
+    """Densities at the nodes of a grid."""
 
-    Attributes:
-        values: φ ≥ 0, shape (nx, ny, nz).
-        origin: Position [m, F] of node (0, 0, 0), shape (3,).
-        spacing: Distances between nodes [m], shape (3,).
-    """
-
-    values: Float[np.ndarray, "nx ny nz"]
-    origin: Float[np.ndarray, "3"]
-    spacing: Float[np.ndarray, "3"]
+    values: Float[np.ndarray, "nx ny nz"]  # φ ≥ 0, shape (nx, ny, nz)
+    origin: Float[np.ndarray, "3"]  # Position [m, F] of node (0, 0, 0), shape (3,)
+    spacing: Float[np.ndarray, "3"]  # Distances between nodes [m], shape (3,)
 
     def padded(self) -> "Grid":
         """With a layer of emptiness around it."""
@@ -48,19 +42,12 @@ class Grid(NamedTuple):
 
 
 class Mesh(NamedTuple):
-    """A level surface and how it was made.
+    """A level surface and how it was made."""
 
-    Attributes:
-        triangles: The surface.
-        level: Its density.
-        cleaned: Whether floaters were dropped, cavities filled and the border of the grid closed.
-        seconds: Time it took [s].
-    """
-
-    triangles: Triangles
-    level: float
-    cleaned: bool
-    seconds: float
+    triangles: Triangles  # The surface
+    level: float  # Its density
+    cleaned: bool  # Whether floaters were dropped, cavities filled and the border of the grid closed
+    seconds: float  # Time it took [s]
 
     @property
     def moments(self) -> Moments:

@@ -25,21 +25,13 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 class _Numbers(NamedTuple):
-    """Numbers of a scene with one range.
+    """Numbers of a scene with one range."""
 
-    Attributes:
-        what: What they are, for messages.
-        values: The numbers.
-        least: They are not smaller, or, where it is zero and `divides`, larger.
-        most: They are not larger.
-        divides: Whether zero is out of range.
-    """
-
-    what: str
-    values: list[Array]
-    least: float = -_LARGEST
-    most: float = _LARGEST
-    divides: bool = False
+    what: str  # What they are, for messages
+    values: list[Array]  # The numbers
+    least: float = -_LARGEST  # They are not smaller, or, where it is zero and `divides`, larger
+    most: float = _LARGEST  # They are not larger
+    divides: bool = False  # Whether zero is out of range
 
 
 def sound(scene: Scene) -> Bool[Array, ""]:

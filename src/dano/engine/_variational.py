@@ -17,17 +17,11 @@ from dano.scene import Control, lifted, Scene, State
 
 
 class Prepared(eqx.Module):
-    """What does not change from step to step: see `prepare`.
+    """What does not change from step to step: see `prepare`."""
 
-    Attributes:
-        tables: Of the scene.
-        sound: Whether the numbers of the scene are in their ranges, see `dano.engine._finite`.
-        capacity: Chunks of points that a step has room for (static).
-    """
-
-    tables: Tables
-    sound: Bool[Array, ""]
-    capacity: int = eqx.field(static=True)
+    tables: Tables  # Of the scene
+    sound: Bool[Array, ""]  # Whether the numbers of the scene are in their ranges, see `dano.engine._finite`
+    capacity: int = eqx.field(static=True)  # Chunks of points that a step has room for (static)
 
 
 def prepare(scene: Scene, capacity: int | None) -> Prepared:

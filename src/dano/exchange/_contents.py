@@ -21,35 +21,20 @@ VISUAL = "visual"
 
 
 class Contents(NamedTuple):
-    """An object as other programs take it; everything in its field frame F.
+    """An object as other programs take it; everything in its field frame F."""
 
-    Attributes:
-        name: A letter, then letters, digits and underscores.
-        mass: [kg].
-        com: Centre of mass [m, F], shape (3,).
-        inertia: About the centre of mass, in the axes of F [kg m²], shape (3, 3).
-        mesh: What is seen.
-        resolution: Nodes along the longest axis that it was made with.
-        normals: At its vertices, shape (v, 3).
-        texture: Its colours, if they are known.
-        pieces: Convex solids whose union stands for the object in contact.
-        contact: Parameters of its contacts.
-        splats: Gaussians that it is drawn with, if it was seen by them.
-        surroundings: Those of what does not move with it.
-    """
-
-    name: str
-    mass: float
-    com: Float[np.ndarray, "3"]
-    inertia: Float[np.ndarray, "3 3"]
-    mesh: Triangles
-    resolution: int
-    normals: Float[np.ndarray, "v 3"]
-    texture: Texture | None
-    pieces: list[Triangles]
-    contact: ContactParams
-    splats: Splats | None = None
-    surroundings: Splats | None = None
+    name: str  # A letter, then letters, digits and underscores
+    mass: float  # [kg]
+    com: Float[np.ndarray, "3"]  # Centre of mass [m, F], shape (3,)
+    inertia: Float[np.ndarray, "3 3"]  # About the centre of mass, in the axes of F [kg m²], shape (3, 3)
+    mesh: Triangles  # What is seen
+    resolution: int  # Nodes along the longest axis that it was made with
+    normals: Float[np.ndarray, "v 3"]  # At its vertices, shape (v, 3)
+    texture: Texture | None  # Its colours, if they are known
+    pieces: list[Triangles]  # Convex solids whose union stands for the object in contact
+    contact: ContactParams  # Parameters of its contacts
+    splats: Splats | None = None  # Gaussians that it is drawn with, if it was seen by them
+    surroundings: Splats | None = None  # Those of what does not move with it
 
     @property
     def friction(self) -> float:

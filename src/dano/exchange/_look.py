@@ -26,14 +26,10 @@ _LEAST_CELL = 6
 
 
 class Texture(NamedTuple):
-    """A picture and where on it the triangles are.
+    """A picture and where on it the triangles are."""
 
-    Attributes:
-        image: sRGB, first row at the top, shape (n, n, 3).
-        corners: Coordinates (u, v) of the corners of each face, from the lower left, shape (f, 3, 2).
-    """
-
-    image: UInt8[np.ndarray, "n n 3"]
+    image: UInt8[np.ndarray, "n n 3"]  # sRGB, first row at the top, shape (n, n, 3)
+    # Coordinates (u, v) of the corners of each face, from the lower left, shape (f, 3, 2).
     corners: Float[np.ndarray, "f 3 2"]
 
 

@@ -14,15 +14,10 @@ MODES = ("rgb_array", "human")
 
 
 class Rendering:
-    """Shows the states of an environment in one mode, or not at all.
+    """Shows the states of an environment in one mode, or not at all."""
 
-    Attributes:
-        mode: One of `MODES`, or None.
-        fps: Steps of the environment in a second of the scene.
-    """
-
-    mode: str | None
-    fps: int
+    mode: str | None  # One of `MODES`, or None
+    fps: int  # Steps of the environment in a second of the scene
 
     def __init__(
         self,

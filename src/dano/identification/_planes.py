@@ -17,34 +17,21 @@ from dano.maths import product
 
 
 class Smoothing(NamedTuple):
-    """Where unknowns of windows are drawn: at c ± L d, as near to the point as the bounds allow.
+    """Where unknowns of windows are drawn: at c ± L d, as near to the point as the bounds allow."""
 
-    Attributes:
-        draws: Rows d, without their opposites, shape (K, u); Σ d dᵀ = K 1.
-        spread: L of each window, shape (windows, u, u).
-        inverse: L⁻¹.
-        lower: Bounds of the parameters, shape (p,); may be −∞.
-        upper: Bounds; may be ∞.
-    """
-
-    draws: Float[Array, "k u"]
-    spread: Float[Array, "w u u"]
-    inverse: Float[Array, "w u u"]
-    lower: Float[Array, " p"]
-    upper: Float[Array, " p"]
+    draws: Float[Array, "k u"]  # Rows d, without their opposites, shape (K, u); Σ d dᵀ = K 1
+    spread: Float[Array, "w u u"]  # L of each window, shape (windows, u, u)
+    inverse: Float[Array, "w u u"]  # L⁻¹
+    lower: Float[Array, " p"]  # Bounds of the parameters, shape (p,); may be −∞
+    upper: Float[Array, " p"]  # Bounds; may be ∞
 
 
 class Plane(NamedTuple):
-    """The plane through the residuals around a point.
+    """The plane through the residuals around a point."""
 
-    Attributes:
-        value: At the point.
-        slope: By the unknowns.
-        ripple: By which residuals miss it in their odd part, so that curvature does not count.
-    """
-
-    value: Float[Array, " r"]
-    slope: Float[Array, "r u"]
+    value: Float[Array, " r"]  # At the point
+    slope: Float[Array, "r u"]  # By the unknowns
+    # By which residuals miss it in their odd part, so that curvature does not count.
     ripple: Float[Array, "k r"]
 
 

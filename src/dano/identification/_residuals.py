@@ -98,71 +98,46 @@ class Start(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What residuals depend on besides the unknowns; its static part decides the program.
+    """What residuals depend on besides the unknowns; its static part decides the program."""
 
-    Attributes:
-        scene: The scene.
-        policy: Controls as a function of state and time, or None.
-        engine: What simulates.
-        windows: The windows.
-        huber: Length of a residual, in standard deviations, from which it counts linearly; None: never.
-        jumps: Standard deviations by which a window may miss the beginning of the next, of the numbers of
-            `Start.jump`, or None.
-        selections: The parameters.
-        bodies: Which bodies were observed.
-        quantities: Which quantities count.
-        start: What of the initial states is estimated.
-        n_steps: Steps of each window.
-        reverse: Whether Jacobians are taken in reverse mode.
-        batch: How many windows a device simulates at once.
-        mesh: The devices of this process.
-    """
-
-    scene: Scene
-    policy: Any
-    engine: AbstractEngine
-    windows: Windows
+    scene: Scene  # The scene
+    policy: Any  # Controls as a function of state and time, or None
+    engine: AbstractEngine  # What simulates
+    windows: Windows  # The windows
+    # Length of a residual, in standard deviations, from which it counts linearly; None: never.
     huber: Float[Array, ""] | None
+    # Standard deviations by which a window may miss the beginning of the next, of the numbers of
+    # `Start.jump`, or None.
     jumps: Float[Array, " c"] | None
-    selections: tuple[Selection, ...]
-    bodies: tuple[int, ...]
-    quantities: tuple[str, ...]
-    start: Start
-    n_steps: int
-    reverse: bool
-    batch: int
-    mesh: Mesh
+    selections: tuple[Selection, ...]  # The parameters
+    bodies: tuple[int, ...]  # Which bodies were observed
+    quantities: tuple[str, ...]  # Which quantities count
+    start: Start  # What of the initial states is estimated
+    n_steps: int  # Steps of each window
+    reverse: bool  # Whether Jacobians are taken in reverse mode
+    batch: int  # How many windows a device simulates at once
+    mesh: Mesh  # The devices of this process
 
 
 class Linearized(NamedTuple):
     """A simulation of all windows, with derivatives: leaves with a leading axis of windows.
 
     Unknowns u of a window are the coordinates x, then the change of its initial state.
-
-    Attributes:
-        loss: Half the sum of squared residuals, or Huber's function of them.
-        gradient: Of the loss.
-        hessian: Gauss–Newton's.
-        jump: By which a window misses the beginning of the next, in standard deviations; one zero if it may.
-        jump_slope: Its derivative.
-        predicted: States at the frames: positions and velocities that correspond to the observed ones.
-        lengths: Of the residuals in standard deviations; −1 where nothing was observed.
-        unconverged: Steps that did not converge.
-        ripple: Gradients of the loss that ripples of the residuals would have alone, one for each draw of
-            unknowns; one of zeros without smoothing.
-        jump_ripple: Ripples of `jump`.
     """
 
-    loss: Float[Array, " w"]
-    gradient: Float[Array, "w u"]
-    hessian: Float[Array, "w u u"]
+    loss: Float[Array, " w"]  # Half the sum of squared residuals, or Huber's function of them
+    gradient: Float[Array, "w u"]  # Of the loss
+    hessian: Float[Array, "w u u"]  # Gauss–Newton's
+    # By which a window misses the beginning of the next, in standard deviations; one zero if it may.
     jump: Float[Array, "w c"]
-    jump_slope: Float[Array, "w c u"]
-    predicted: State
-    lengths: Float[Array, "w f b q"]
-    unconverged: Int[Array, " w"]
+    jump_slope: Float[Array, "w c u"]  # Its derivative
+    predicted: State  # States at the frames: positions and velocities that correspond to the observed ones
+    lengths: Float[Array, "w f b q"]  # Of the residuals in standard deviations; −1 where nothing was observed
+    unconverged: Int[Array, " w"]  # Steps that did not converge
+    # Gradients of the loss that ripples of the residuals would have alone, one for each draw of unknowns; one
+    # of zeros without smoothing.
     ripple: Float[Array, "w k u"]
-    jump_ripple: Float[Array, "w k c"]
+    jump_ripple: Float[Array, "w k c"]  # Ripples of `jump`
 
 
 class _Late(eqx.Module):

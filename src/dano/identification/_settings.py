@@ -111,25 +111,15 @@ class IdentifyOptions:
 
 @dataclass(frozen=True)
 class Setup:
-    """Arguments of `identify`, checked, that do not depend on the motions.
+    """Arguments of `identify`, checked, that do not depend on the motions."""
 
-    Attributes:
-        space: The unknowns.
-        scene: The scene.
-        controls: As they were given.
-        initial: Quantities that are estimated of the state in which each window begins.
-        noise: Standard deviation of each quantity that counts.
-        options: How the search runs.
-        engine: What simulates.
-    """
-
-    space: Space
-    scene: Scene
-    controls: Any
-    initial: tuple[str, ...]
-    noise: dict[str, float]
-    options: IdentifyOptions
-    engine: AbstractEngine
+    space: Space  # The unknowns
+    scene: Scene  # The scene
+    controls: Any  # As they were given
+    initial: tuple[str, ...]  # Quantities that are estimated of the state in which each window begins
+    noise: dict[str, float]  # Standard deviation of each quantity that counts
+    options: IdentifyOptions  # How the search runs
+    engine: AbstractEngine  # What simulates
 
 
 def estimated(initial: str | Sequence[str] | None, motions: Sequence[Motion]) -> tuple[str, ...]:

@@ -93,21 +93,13 @@ class Smoothed(Protocol):
 
 
 class _Sight(NamedTuple):
-    """What planes say of a point.
+    """What planes say of a point."""
 
-    Attributes:
-        found: The planes.
-        normal: Normal equations.
-        errors: Standard errors of the parameters, ripples not counted; ∞ where they are flat.
-        away: Distance to the minimum of the trend, in standard errors, largest of all parameters.
-        scatter: By which ripples move the answer, in the same way.
-    """
-
-    found: Linearized
-    normal: NormalEquations
-    errors: np.ndarray
-    away: float
-    scatter: float
+    found: Linearized  # The planes
+    normal: NormalEquations  # Normal equations
+    errors: np.ndarray  # Standard errors of the parameters, ripples not counted; ∞ where they are flat
+    away: float  # Distance to the minimum of the trend, in standard errors, largest of all parameters
+    scatter: float  # By which ripples move the answer, in the same way
 
 
 class _Point(NamedTuple):
@@ -229,19 +221,12 @@ def _descended(walk: Iterator[tuple[_Point, _Sight]], point: _Point) -> _Point:
 
 
 class _End(NamedTuple):
-    """Where a walk ended: the mean of its last points.
+    """Where a walk ended: the mean of its last points."""
 
-    Attributes:
-        point: The mean, with initial states for it.
-        sight: What is seen there.
-        scatter: Covariance of the points, shape (p, p).
-        steady: Whether the walk had come to rest but for that scatter.
-    """
-
-    point: _Point
-    sight: _Sight
-    scatter: np.ndarray
-    steady: bool
+    point: _Point  # The mean, with initial states for it
+    sight: _Sight  # What is seen there
+    scatter: np.ndarray  # Covariance of the points, shape (p, p)
+    steady: bool  # Whether the walk had come to rest but for that scatter
 
 
 def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:

@@ -23,18 +23,13 @@ _MASSES = (".mass", ".mass_scale", ".inertia")
 
 
 class Uncertainty(NamedTuple):
-    """What the data say of the coordinates.
+    """What the data say of the coordinates."""
 
-    Attributes:
-        covariance: Of the coordinates, shape (p, p); ∞ on the diagonal where the data say nothing, NaN for
-            what lies on a bound.
-        freedom: Observed numbers less estimated ones.
-        messages: Sentences about what is not determined.
-    """
-
+    # Of the coordinates, shape (p, p); ∞ on the diagonal where the data say nothing, NaN for what lies on a
+    # bound.
     covariance: np.ndarray
-    freedom: int
-    messages: tuple[str, ...]
+    freedom: int  # Observed numbers less estimated ones
+    messages: tuple[str, ...]  # Sentences about what is not determined
 
 
 def uncertainty(

@@ -25,41 +25,32 @@ _CONFIGURATION = ("position", "orientation")
 
 
 class Windows(eqx.Module):
-    """All windows of all motions, padded to one length; leaves have a leading axis of windows.
+    """All windows of all motions, padded to one length; leaves have a leading axis of windows."""
 
-    Attributes:
-        begin: Time of the first frame of each [s].
-        first_step: Steps from the beginning of the motion to that of the window.
-        origins: Which bodies have positions of their field frame's origin instead of the centre of mass.
-        frame: Where in the rollout each frame lies: step, and share of the next one.
-        moment: The same for velocities, which hold half a step before.
-        observed: What was seen, zero where nothing was; leaves (w, frames, bodies, ·).
-        joints: The same for joint coordinates, see `Motion.q`; None if no motion has them.
-        weights: One over the standard deviation of each number, zero where nothing was seen, by quantity,
-            "q" for joint coordinates; shape (w, frames, bodies).
-        whitening: What makes residuals of pose with these weights, position then orientation, independent and
-            of variance one, by the motions' covariances, shape (w, frames, bodies, 6, 6); None if no motion
-            has any.
-        common: Columns U, shape (w, frames, bodies, 6, 7), by which these residuals r become r − U Uᵀ r: what
-            all poses of a body are off by alike does not count; None if no motion says it (`Motion.alike`).
-        end: Where the next window of the same motion begins, as `frame` has it.
-        chained: Whether there is such a window, 1 or 0.
-        controls: Forces and torques of each step, or None.
-    """
-
-    begin: Float[Array, " w"]
-    first_step: Int[Array, " w"]
+    begin: Float[Array, " w"]  # Time of the first frame of each [s]
+    first_step: Int[Array, " w"]  # Steps from the beginning of the motion to that of the window
+    # Which bodies have positions of their field frame's origin instead of the centre of mass.
     origins: Bool[Array, "w n"]
+    # Where in the rollout each frame lies: step, and share of the next one.
     frame: tuple[Int[Array, "w f"], Float[Array, "w f"]]
+    # The same for velocities, which hold half a step before.
     moment: tuple[Int[Array, "w f"], Float[Array, "w f"]]
-    observed: State
+    observed: State  # What was seen, zero where nothing was; leaves (w, frames, bodies, ·)
+    # The same for joint coordinates, see `Motion.q`; None if no motion has them.
     joints: Float[Array, "w f n 3"] | None
+    # One over the standard deviation of each number, zero where nothing was seen, by quantity, "q" for joint
+    # coordinates; shape (w, frames, bodies).
     weights: dict[str, Float[Array, "w f n"]]
+    # What makes residuals of pose with these weights, position then orientation, independent and of variance
+    # one, by the motions' covariances, shape (w, frames, bodies, 6, 6); None if no motion has any.
     whitening: Float[Array, "w f n 6 6"] | None
+    # Columns U, shape (w, frames, bodies, 6, 7), by which these residuals r become r − U Uᵀ r: what all poses
+    # of a body are off by alike does not count; None if no motion says it (`Motion.alike`).
     common: Float[Array, "w f n 6 7"] | None
+    # Where the next window of the same motion begins, as `frame` has it.
     end: tuple[Int[Array, " w"], Float[Array, " w"]]
-    chained: Float[Array, " w"]
-    controls: Control | None
+    chained: Float[Array, " w"]  # Whether there is such a window, 1 or 0
+    controls: Control | None  # Forces and torques of each step, or None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,23 +25,16 @@ _ALONG = 8
 
 
 class Surface(NamedTuple):
-    """Samples of a surface.
+    """Samples of a surface."""
 
-    Attributes:
-        points: [m], or directions on the unit ball, shape (n, 3).
-        vectors: Vector areas [m²], zero where the last block is filled up, shape (n, 3).
-        precedence: Root of their number over the place in an order that begins evenly spread, shape (n,).
-        balls: Centre and radius [m] of a ball around each block, shape (n / 16, 4).
-        runs: The same around each run of eight blocks.
-        turning: How samples turn, a number.
-    """
-
-    points: Float[np.ndarray, "n 3"]
+    points: Float[np.ndarray, "n 3"]  # [m], or directions on the unit ball, shape (n, 3)
+    # Vector areas [m²], zero where the last block is filled up, shape (n, 3).
     vectors: Float[np.ndarray, "n 3"]
+    # Root of their number over the place in an order that begins evenly spread, shape (n,).
     precedence: Float[np.ndarray, " n"]
-    balls: Float[np.ndarray, "b 4"]
-    runs: Float[np.ndarray, "r 4"]
-    turning: int = 0
+    balls: Float[np.ndarray, "b 4"]  # Centre and radius [m] of a ball around each block, shape (n / 16, 4)
+    runs: Float[np.ndarray, "r 4"]  # The same around each run of eight blocks
+    turning: int = 0  # How samples turn, a number
 
     def moved(self, rotation: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"]) -> "Surface":
         """The same in another frame."""

@@ -22,19 +22,12 @@ Chooser = Callable[[Any, int, int], Settings | None]
 
 
 class Carrier(NamedTuple):
-    """A body with an object.
+    """A body with an object."""
 
-    Attributes:
-        body: Its index.
-        geom: The geom that stands for the object in MuJoCo's list of contacts.
-        thing: The object.
-        others: Geoms that it may touch, by the tree of bodies.
-    """
-
-    body: int
-    geom: int
-    thing: Thing
-    others: Int[np.ndarray, " k"]
+    body: int  # Its index
+    geom: int  # The geom that stands for the object in MuJoCo's list of contacts
+    thing: Thing  # The object
+    others: Int[np.ndarray, " k"]  # Geoms that it may touch, by the tree of bodies
 
 
 class Table:

@@ -14,35 +14,20 @@ from dano.scene_file import load_object
 
 @dataclass(frozen=True)
 class Thing:
-    """An object on a body.
+    """An object on a body."""
 
-    Attributes:
-        obj: The object.
-        surface: Its samples, in the body frame.
-        middle: Centre of a ball around all samples [m].
-        radius: Of that ball [m].
-        size: Largest extent [m].
-        thickness: How deep its deepest place lies below its surface [m].
-        rotation: Field frame → body frame, shape (3, 3).
-        origin: Of the field frame, in the body frame [m].
-        mass: [kg].
-        com: Centre of mass [m, body frame].
-        inertia: About it, in the axes of the body frame [kg m²].
-        bits: contype and conaffinity, as of MuJoCo's geoms.
-    """
-
-    obj: NeuralObject
-    surface: Surface
-    middle: Float[np.ndarray, "3"]
-    radius: float
-    size: float
-    thickness: float
-    rotation: Float[np.ndarray, "3 3"]
-    origin: Float[np.ndarray, "3"]
-    mass: float
-    com: Float[np.ndarray, "3"]
-    inertia: Float[np.ndarray, "3 3"]
-    bits: tuple[int, int]
+    obj: NeuralObject  # The object
+    surface: Surface  # Its samples, in the body frame
+    middle: Float[np.ndarray, "3"]  # Centre of a ball around all samples [m]
+    radius: float  # Of that ball [m]
+    size: float  # Largest extent [m]
+    thickness: float  # How deep its deepest place lies below its surface [m]
+    rotation: Float[np.ndarray, "3 3"]  # Field frame → body frame, shape (3, 3)
+    origin: Float[np.ndarray, "3"]  # Of the field frame, in the body frame [m]
+    mass: float  # [kg]
+    com: Float[np.ndarray, "3"]  # Centre of mass [m, body frame]
+    inertia: Float[np.ndarray, "3 3"]  # About it, in the axes of the body frame [kg m²]
+    bits: tuple[int, int]  # contype and conaffinity, as of MuJoCo's geoms
 
 
 def checked_thing(

@@ -35,91 +35,51 @@ class Motion(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """What else a step depends on.
+    """What else a step depends on."""
 
-    Attributes:
-        force: On the bodies, at their centres of mass [N, W], shape (n, 3).
-        torque: [N m, W], shape (n, 3).
-        effort: On the joint coordinates [N m or N], shape (k,).
-        command: Of motors, shape (k,).
-        mass: [kg], shape (n,).
-        inertia: [kg m², B], shape (n, 3, 3).
-        friction: Sliding friction of each pair of the scene, shape (p,).
-        restitution: Coefficient of restitution of each pair, shape (p,).
-        gravity: [m/s²], shape (3,).
-        timestep: [s], shape ().
-        damping: Of the joint coordinates, as all that follows; see `JointLaws`. Shape (k,).
-        armature: Shape (k,).
-        stiffness: Shape (k,).
-        rest: Shape (k,).
-        stiction: Friction of the joints, shape (k,).
-        limits: Shape (k, 2).
-        motor: Shape (k, 5).
-    """
-
-    force: Float[np.ndarray, "n 3"]
-    torque: Float[np.ndarray, "n 3"]
-    effort: Float[np.ndarray, " k"]
-    command: Float[np.ndarray, " k"]
-    mass: Float[np.ndarray, " n"]
-    inertia: Float[np.ndarray, "n 3 3"]
-    friction: Float[np.ndarray, " p"]
-    restitution: Float[np.ndarray, " p"]
-    gravity: Float[np.ndarray, "3"]
-    timestep: Float[np.ndarray, ""]
+    force: Float[np.ndarray, "n 3"]  # On the bodies, at their centres of mass [N, W], shape (n, 3)
+    torque: Float[np.ndarray, "n 3"]  # [N m, W], shape (n, 3)
+    effort: Float[np.ndarray, " k"]  # On the joint coordinates [N m or N], shape (k,)
+    command: Float[np.ndarray, " k"]  # Of motors, shape (k,)
+    mass: Float[np.ndarray, " n"]  # [kg], shape (n,)
+    inertia: Float[np.ndarray, "n 3 3"]  # [kg m², B], shape (n, 3, 3)
+    friction: Float[np.ndarray, " p"]  # Sliding friction of each pair of the scene, shape (p,)
+    restitution: Float[np.ndarray, " p"]  # Coefficient of restitution of each pair, shape (p,)
+    gravity: Float[np.ndarray, "3"]  # [m/s²], shape (3,)
+    timestep: Float[np.ndarray, ""]  # [s], shape ()
+    # Of the joint coordinates, as all that follows; see `JointLaws`. Shape (k,).
     damping: Float[np.ndarray, " k"]
-    armature: Float[np.ndarray, " k"]
-    stiffness: Float[np.ndarray, " k"]
-    rest: Float[np.ndarray, " k"]
-    stiction: Float[np.ndarray, " k"]
-    limits: Float[np.ndarray, "k 2"]
-    motor: Float[np.ndarray, "k 5"]
+    armature: Float[np.ndarray, " k"]  # Shape (k,)
+    stiffness: Float[np.ndarray, " k"]  # Shape (k,)
+    rest: Float[np.ndarray, " k"]  # Shape (k,)
+    stiction: Float[np.ndarray, " k"]  # Friction of the joints, shape (k,)
+    limits: Float[np.ndarray, "k 2"]  # Shape (k, 2)
+    motor: Float[np.ndarray, "k 5"]  # Shape (k, 5)
 
 
 class _Single(NamedTuple):
-    """A joint of MuJoCo's with one coordinate.
+    """A joint of MuJoCo's with one coordinate."""
 
-    Attributes:
-        joint: Its index.
-        place: Coordinate of ours.
-        ratio: 1, but of one that mimics another, see `dano.Joint`.
-        shift: 0, the same.
-        leads: Whether the coordinate is its own.
-    """
-
-    joint: int
-    place: int
-    ratio: float
-    shift: float
-    leads: bool
+    joint: int  # Its index
+    place: int  # Coordinate of ours
+    ratio: float  # 1, but of one that mimics another, see `dano.Joint`
+    shift: float  # 0, the same
+    leads: bool  # Whether the coordinate is its own
 
 
 class _Places(NamedTuple):
-    """Where things of a scene stand in MuJoCo's arrays. Joints are MuJoCo's, in the order of ours.
+    """Where things of a scene stand in MuJoCo's arrays. Joints are MuJoCo's, in the order of ours."""
 
-    Attributes:
-        bodies: Index of each body.
-        fixed: Rows of the bodies that never move.
-        moving: Of the others.
-        free: Of those that hang on no joint.
-        free_q: Their seven places in qpos.
-        free_v: Their six places in qvel.
-        singles: Hinges and slides, those of planar joints among them.
-        balls: Joint and first coordinate of balls.
-        dofs: Place in qvel of each coordinate of ours.
-        motors: Actuator and coordinate of each motor.
-    """
-
-    bodies: Int[np.ndarray, " n"]
-    fixed: Int[np.ndarray, " f"]
-    moving: Int[np.ndarray, " m"]
-    free: Int[np.ndarray, " r"]
-    free_q: Int[np.ndarray, "r 7"]
-    free_v: Int[np.ndarray, "r 6"]
-    singles: list[_Single]
-    balls: list[tuple[int, int]]
-    dofs: Int[np.ndarray, " k"]
-    motors: list[tuple[int, int]]
+    bodies: Int[np.ndarray, " n"]  # Index of each body
+    fixed: Int[np.ndarray, " f"]  # Rows of the bodies that never move
+    moving: Int[np.ndarray, " m"]  # Of the others
+    free: Int[np.ndarray, " r"]  # Of those that hang on no joint
+    free_q: Int[np.ndarray, "r 7"]  # Their seven places in qpos
+    free_v: Int[np.ndarray, "r 6"]  # Their six places in qvel
+    singles: list[_Single]  # Hinges and slides, those of planar joints among them
+    balls: list[tuple[int, int]]  # Joint and first coordinate of balls
+    dofs: Int[np.ndarray, " k"]  # Place in qvel of each coordinate of ours
+    motors: list[tuple[int, int]]  # Actuator and coordinate of each motor
 
 
 class Twin:

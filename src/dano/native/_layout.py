@@ -20,17 +20,11 @@ _NUMBERS = {
 
 
 class ArrayField(NamedTuple):
-    """An array among the parameters.
+    """An array among the parameters."""
 
-    Attributes:
-        at: Where it begins [bytes].
-        ndim: Its axes.
-        items: NumPy's type of its items, as JSON can have it: see `dtype`.
-    """
-
-    at: int
-    ndim: int
-    items: Any
+    at: int  # Where it begins [bytes]
+    ndim: int  # Its axes
+    items: Any  # NumPy's type of its items, as JSON can have it: see `dtype`
 
     @property
     def dtype(self) -> np.dtype:
@@ -44,15 +38,10 @@ class ArrayField(NamedTuple):
 
 
 class NumberField(NamedTuple):
-    """A number among the parameters.
+    """A number among the parameters."""
 
-    Attributes:
-        at: Where it begins [bytes].
-        format: As `struct` has it.
-    """
-
-    at: int
-    format: str
+    at: int  # Where it begins [bytes]
+    format: str  # As `struct` has it
 
 
 class Layout(NamedTuple):

@@ -49,17 +49,11 @@ class ContactSamples(eqx.Module):
 
 
 class Lattice(eqx.Module):
-    """Density on the corners of a grid of cells (host arrays).
+    """Density on the corners of a grid of cells (host arrays)."""
 
-    Attributes:
-        values: φ at the corners, shape (nx + 1, ny + 1, nz + 1).
-        origin: First corner [m, F], shape (3,).
-        side: Sides of a cell [m], shape (3,).
-    """
-
-    values: np.ndarray
-    origin: np.ndarray
-    side: np.ndarray
+    values: np.ndarray  # φ at the corners, shape (nx + 1, ny + 1, nz + 1)
+    origin: np.ndarray  # First corner [m, F], shape (3,)
+    side: np.ndarray  # Sides of a cell [m], shape (3,)
 
     @classmethod
     def create(
@@ -109,19 +103,13 @@ def _finer(extent: np.ndarray, resolution: int) -> str:
 
 
 class Region(eqx.Module):
-    """Which part of space an object occupies (host arrays on a lattice).
+    """Which part of space an object occupies (host arrays on a lattice)."""
 
-    Attributes:
-        lattice: The lattice that the masks live on.
-        occupied: {φ ≥ level}, without what is not connected to the largest part unless floaters were kept.
-        cavity: Empty lattice points enclosed by `occupied`.
-        level: The density that bounds it.
-    """
-
-    lattice: Lattice
+    lattice: Lattice  # The lattice that the masks live on
+    # {φ ≥ level}, without what is not connected to the largest part unless floaters were kept.
     occupied: np.ndarray
-    cavity: np.ndarray
-    level: float
+    cavity: np.ndarray  # Empty lattice points enclosed by `occupied`
+    level: float  # The density that bounds it
 
     @classmethod
     def create(cls, lattice: Lattice, level: float, *, floaters: bool) -> "Region":

@@ -67,24 +67,16 @@ class SurfaceSamples(eqx.Module):
 
 
 class _Shell(NamedTuple):
-    """Points drawn around a surface and projected onto it (host arrays).
+    """Points drawn around a surface and projected onto it (host arrays)."""
 
-    Attributes:
-        points: On the surface [m], shape (m, 3).
-        normals: Unit gradients of the distance where each was drawn, shape (m, 3).
-        areas: Measure of each [m²], shape (m,).
-        stretch: How far the projection moves along the surface when the point in the shell does, squared and
-            summed over two directions: 2 on a face, 1 on an edge, 0 on a corner; shape (m,).
-        settled: Whether the projection ended on the surface, shape (m,).
-        spacing: Side of the cells in which they were drawn [m].
-    """
-
-    points: np.ndarray
-    normals: np.ndarray
-    areas: np.ndarray
+    points: np.ndarray  # On the surface [m], shape (m, 3)
+    normals: np.ndarray  # Unit gradients of the distance where each was drawn, shape (m, 3)
+    areas: np.ndarray  # Measure of each [m²], shape (m,)
+    # How far the projection moves along the surface when the point in the shell does, squared and summed over
+    # two directions: 2 on a face, 1 on an edge, 0 on a corner; shape (m,).
     stretch: np.ndarray
-    settled: np.ndarray
-    spacing: float
+    settled: np.ndarray  # Whether the projection ended on the surface, shape (m,)
+    spacing: float  # Side of the cells in which they were drawn [m]
 
 
 def draw_surface(

@@ -20,22 +20,14 @@ class Friction:
         by_rate dv_n − grip du − turning (direction · du),
 
     with v_n the separating speed, on which b depends. Units are those of λ: [Pa], [N] or [N m].
-
-    Attributes:
-        value: λ, projected onto |λ| ≤ b.
-        change: Change of λ that makes it fit the velocity.
-        by_rate: Over [m/s].
-        grip: Over a unit of u.
-        turning: Over a unit of u; zero where it sticks.
-        direction: û, zero where it sticks.
     """
 
-    value: vec3
-    change: vec3
-    by_rate: vec3
-    grip: real
-    turning: vec3
-    direction: vec3
+    value: vec3  # λ, projected onto |λ| ≤ b
+    change: vec3  # Change of λ that makes it fit the velocity
+    by_rate: vec3  # Over [m/s]
+    grip: real  # Over a unit of u
+    turning: vec3  # Over a unit of u; zero where it sticks
+    direction: vec3  # û, zero where it sticks
 
 
 @wp.func
@@ -71,19 +63,12 @@ def friction_with_dual(
 
 @wp.struct
 class Slip:
-    """A slip, and friction there as a derivative takes it.
+    """A slip, and friction there as a derivative takes it."""
 
-    Attributes:
-        slip: u₀ [m/s].
-        direction: Of the friction, −u₀/max(|u₀|, v_s).
-        grip: b/v_g [Pa s/m].
-        is_gradual: Whether friction is −b/v_g (u − u₀) more for other slips.
-    """
-
-    slip: vec3
-    direction: vec3
-    grip: real
-    is_gradual: bool
+    slip: vec3  # u₀ [m/s]
+    direction: vec3  # Of the friction, −u₀/max(|u₀|, v_s)
+    grip: real  # b/v_g [Pa s/m]
+    is_gradual: bool  # Whether friction is −b/v_g (u − u₀) more for other slips
 
 
 @wp.func

@@ -39,32 +39,23 @@ class Patch:
 
 @wp.struct
 class Impact:
-    """The impact of a pair.
+    """The impact of a pair."""
 
-    Attributes:
-        share: β, share of the contact that is an impact and no lasting contact [1].
-        stiffness: κ [Pa s/m], zero where bodies have not sunk in far enough.
-        depth: δ [m].
-        factor: F, momentum that the damper passes on, by that of the common mass, for each speed that is
-            missing [1]. The softer, the more samples share an impact; goals make up for it.
-        deepest: Depth that another part of the body may have at the end of the step, where its impact is left
-            to the next one [m].
-        part: Share of the impact that the pair carries, ½ where samples of both bodies do [1].
-        delays: Impulses take effect after this share of τ: β where they wait for when bodies meet, 0 where
-            they act from the start of the step.
-        way: Share of the step in which bodies go on as before, all the same.
-        rest: Time from when impulses take effect to the end of the step [s].
-    """
-
-    share: real
-    stiffness: real
-    depth: real
+    share: real  # β, share of the contact that is an impact and no lasting contact [1]
+    stiffness: real  # κ [Pa s/m], zero where bodies have not sunk in far enough
+    depth: real  # δ [m]
+    # F, momentum that the damper passes on, by that of the common mass, for each speed that is missing [1].
+    # The softer, the more samples share an impact; goals make up for it.
     factor: real
+    # Depth that another part of the body may have at the end of the step, where its impact is left to the
+    # next one [m].
     deepest: real
-    part: real
+    part: real  # Share of the impact that the pair carries, ½ where samples of both bodies do [1]
+    # Impulses take effect after this share of τ: β where they wait for when bodies meet, 0 where they act
+    # from the start of the step.
     delays: real
-    way: real
-    rest: real
+    way: real  # Share of the step in which bodies go on as before, all the same
+    rest: real  # Time from when impulses take effect to the end of the step [s]
 
 
 @wp.func

@@ -124,15 +124,10 @@ def spin_seen_from(omega: vec3, inertia: mat33, h: real, lead: real, other: real
 
 @wp.struct
 class EndOfImpact:
-    """What becomes of a body whose spin was solved for when it met another.
+    """What becomes of a body whose spin was solved for when it met another."""
 
-    Attributes:
-        omega: Its spin at the end of the step [rad/s, B].
-        turn: What is added to the spin by which its orientation changes within the step [rad/s, W].
-    """
-
-    omega: vec3
-    turn: vec3
+    omega: vec3  # Its spin at the end of the step [rad/s, B]
+    turn: vec3  # What is added to the spin by which its orientation changes within the step [rad/s, W]
 
 
 @wp.func

@@ -41,59 +41,38 @@ class Part:
 
 @wp.struct
 class PartKind:
-    """Whole numbers of a part.
+    """Whole numbers of a part."""
 
-    Attributes:
-        first_leaf: Of its solid, or its grid.
-        leaves: How many leaves the solid has.
-        by_gradient: 1 where the outward direction is the gradient of the distance: of boxes, cylinders,
-            sampled distances and unions; 0 where the shape knows a direction of its own.
-        first_distance: Place of the first number of the map.
-        map_y: Its nodes along y.
-        map_z: Along z.
-    """
-
-    first_leaf: wp.int32
-    leaves: wp.int32
+    first_leaf: wp.int32  # Of its solid, or its grid
+    leaves: wp.int32  # How many leaves the solid has
+    # 1 where the outward direction is the gradient of the distance: of boxes, cylinders, sampled distances
+    # and unions; 0 where the shape knows a direction of its own.
     by_gradient: wp.int32
-    first_distance: wp.int32
-    map_y: wp.int32
-    map_z: wp.int32
+    first_distance: wp.int32  # Place of the first number of the map
+    map_y: wp.int32  # Its nodes along y
+    map_z: wp.int32  # Along z
 
 
 @wp.struct
 class Fields:
-    """The parts of all fields.
+    """The parts of all fields."""
 
-    Attributes:
-        parts: Shape (worlds, parts).
-        kinds: Shape (parts,).
-        distances: Lower bounds on the distance to where the density is positive [m], from any point whose
-            nearest node it is, of all maps, shape (worlds, nodes).
-    """
-
-    parts: wp.array2d(dtype=Part)
-    kinds: wp.array(dtype=PartKind)
+    parts: wp.array2d(dtype=Part)  # Shape (worlds, parts)
+    kinds: wp.array(dtype=PartKind)  # Shape (parts,)
+    # Lower bounds on the distance to where the density is positive [m], from any point whose nearest node it
+    # is, of all maps, shape (worlds, nodes).
     distances: wp.array2d(dtype=real)
 
 
 @wp.struct
 class Field:
-    """A field: a run of parts, and the first of them.
+    """A field: a run of parts, and the first of them."""
 
-    Attributes:
-        first: Index of the first part.
-        count: Number of parts.
-        part: The first part.
-        kind: Its whole numbers.
-        solid: Its solid, or its grid.
-    """
-
-    first: int
-    count: int
-    part: Part
-    kind: PartKind
-    solid: Solid
+    first: int  # Index of the first part
+    count: int  # Number of parts
+    part: Part  # The first part
+    kind: PartKind  # Its whole numbers
+    solid: Solid  # Its solid, or its grid
 
 
 @wp.struct
@@ -143,17 +122,11 @@ class View:
 
 @wp.struct
 class Sums:
-    """Sums over samples.
+    """Sums over samples."""
 
-    Attributes:
-        share: Σ w φ, or with the mass [kg] ψ.
-        moment: Σ w φ x [m], or ψ χ [kg m, W].
-        direction: Σ w φ d.
-    """
-
-    share: real
-    moment: vec3
-    direction: vec3
+    share: real  # Σ w φ, or with the mass [kg] ψ
+    moment: vec3  # Σ w φ x [m], or ψ χ [kg m, W]
+    direction: vec3  # Σ w φ d
 
 
 @wp.struct

@@ -29,84 +29,52 @@ _FOUND = wp.constant(real(1e-6))
 
 @wp.struct
 class BodyState:
-    """Where a body is at the start of a step, and how the old velocities move it.
+    """Where a body is at the start of a step, and how the old velocities move it."""
 
-    Attributes:
-        position: Of the centre of mass [m, W].
-        orientation: Body → world.
-        ahead: Orientation at the end of the step at the old velocities.
-        velocity: Of the centre of mass [m/s, W].
-        spin: [rad/s, W].
-        gain: What gravity adds to the velocity within the step [m/s, W], zero for a body on a joint.
-        spin_gain: What gyroscopic torque adds to the spin within the step [rad/s, W]; the same.
-        ahead_falling: Orientation at the end of the step with that gain; unused where there are joints.
-        com: Centre of mass in the field frame [m, F].
-        inverse_mass: Effective inverse mass [1/kg], zero for a fixed body.
-        inverse_inertia: Effective inverse inertia [1/(kg m²), W], zero for a fixed body.
-        met: Share of the step after which the body meets a fixed one in an impact; 0 where it does not. Its
-            angular momentum is balanced then.
-        lead: With which the balance sees the spin, see `angular_momentum`: 1 for that of the step, 0 for that
-            at the moment of the balance, in an impact.
-    """
-
-    position: vec3
-    orientation: quat
-    ahead: quat
-    velocity: vec3
-    spin: vec3
-    gain: vec3
-    spin_gain: vec3
-    ahead_falling: quat
-    com: vec3
-    inverse_mass: real
-    inverse_inertia: mat33
+    position: vec3  # Of the centre of mass [m, W]
+    orientation: quat  # Body → world
+    ahead: quat  # Orientation at the end of the step at the old velocities
+    velocity: vec3  # Of the centre of mass [m/s, W]
+    spin: vec3  # [rad/s, W]
+    gain: vec3  # What gravity adds to the velocity within the step [m/s, W], zero for a body on a joint
+    spin_gain: vec3  # What gyroscopic torque adds to the spin within the step [rad/s, W]; the same
+    ahead_falling: quat  # Orientation at the end of the step with that gain; unused where there are joints
+    com: vec3  # Centre of mass in the field frame [m, F]
+    inverse_mass: real  # Effective inverse mass [1/kg], zero for a fixed body
+    inverse_inertia: mat33  # Effective inverse inertia [1/(kg m²), W], zero for a fixed body
+    # Share of the step after which the body meets a fixed one in an impact; 0 where it does not. Its angular
+    # momentum is balanced then.
     met: real
+    # With which the balance sees the spin, see `angular_momentum`: 1 for that of the step, 0 for that at the
+    # moment of the balance, in an impact.
     lead: real
 
 
 @wp.struct
 class PairPose:
-    """A pair of bodies at a moment within a step; in the axes of the second body's solid unless said.
+    """A pair of bodies at a moment within a step; in the axes of the second body's solid unless said."""
 
-    Attributes:
-        points: Sample coordinates → solid frame, without the origin.
-        origin: Where the samples' origin is [m].
-        vectors: Turns vector areas.
-        rotation: Solid axes → world.
-        com: First body's centre of mass [m].
-        velocity: Of the first body's centre of mass relative to the second body [m/s].
-        spin: Of the first body relative to the second [rad/s].
-        gained: What gravity has added to the velocity by then [m/s].
-        gained_on_way: The same, in the mean over the way.
-        spin_gained: What gyroscopic torques have added to the spin [rad/s].
-        spin_gained_on_way: The same, in the mean over the way.
-        gains_after: What the velocity of the end of the step gains from then on [m/s].
-        com_difference: From the second body's centre of mass to the first's at the start [m, W].
-        arms: Sample coordinates → arms from the first body's centre of mass, without their offset. Those of
-            samples that keep facing the solid are those of the start of the step.
-        arm_offset: Their offset [m].
-        lowest: The arm of a ball's or an ellipsoid's densest samples [m]; shorter by the turn where that is
-            above 1 rad a step, because the lowest point then rises and sinks by less than the arm says.
-        axis: The first body's z axis, when the arms are taken.
-    """
-
-    points: mat33
-    origin: vec3
-    vectors: mat33
-    rotation: mat33
-    com: vec3
-    velocity: vec3
-    spin: vec3
-    gained: vec3
-    gained_on_way: vec3
-    spin_gained: vec3
-    spin_gained_on_way: vec3
-    gains_after: vec3
-    com_difference: vec3
+    points: mat33  # Sample coordinates → solid frame, without the origin
+    origin: vec3  # Where the samples' origin is [m]
+    vectors: mat33  # Turns vector areas
+    rotation: mat33  # Solid axes → world
+    com: vec3  # First body's centre of mass [m]
+    velocity: vec3  # Of the first body's centre of mass relative to the second body [m/s]
+    spin: vec3  # Of the first body relative to the second [rad/s]
+    gained: vec3  # What gravity has added to the velocity by then [m/s]
+    gained_on_way: vec3  # The same, in the mean over the way
+    spin_gained: vec3  # What gyroscopic torques have added to the spin [rad/s]
+    spin_gained_on_way: vec3  # The same, in the mean over the way
+    gains_after: vec3  # What the velocity of the end of the step gains from then on [m/s]
+    com_difference: vec3  # From the second body's centre of mass to the first's at the start [m, W]
+    # Sample coordinates → arms from the first body's centre of mass, without their offset. Those of samples
+    # that keep facing the solid are those of the start of the step.
     arms: mat33
-    arm_offset: vec3
+    arm_offset: vec3  # Their offset [m]
+    # The arm of a ball's or an ellipsoid's densest samples [m]; shorter by the turn where that is above 1 rad
+    # a step, because the lowest point then rises and sinks by less than the arm says.
     lowest: vec3
-    axis: vec3
+    axis: vec3  # The first body's z axis, when the arms are taken
 
 
 @wp.struct

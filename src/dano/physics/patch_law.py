@@ -21,103 +21,60 @@ _TWO_OVER_PI = wp.constant(real(2.0 / math.pi))
 
 @wp.struct
 class PatchMaterial:
-    """Numbers of a contact with the centroid law, as `CentroidLaw.numbers` lists them.
+    """Numbers of a contact with the centroid law, as `CentroidLaw.numbers` lists them."""
 
-    Attributes:
-        spring: k [N/kg].
-        damper: d [N s/(m kg)].
-        sliding_friction: μ_s [1].
-        sliding_drag: δ_s [s/m].
-        torsional_friction: μ_t [m].
-        torsional_drag: δ_t [m s].
-        rolling_friction: μ_r [m].
-        rolling_drag: δ_r [m s].
-        smoothing: s [s/m; s/rad for the moments].
-        regularizer: ε [m/s; rad/s].
-        stiction: v_s [m/s; rad/s], 0 where friction is smooth.
-    """
-
-    spring: real
-    damper: real
-    sliding_friction: real
-    sliding_drag: real
-    torsional_friction: real
-    torsional_drag: real
-    rolling_friction: real
-    rolling_drag: real
-    smoothing: real
-    regularizer: real
-    stiction: real
+    spring: real  # k [N/kg]
+    damper: real  # d [N s/(m kg)]
+    sliding_friction: real  # μ_s [1]
+    sliding_drag: real  # δ_s [s/m]
+    torsional_friction: real  # μ_t [m]
+    torsional_drag: real  # δ_t [m s]
+    rolling_friction: real  # μ_r [m]
+    rolling_drag: real  # δ_r [m s]
+    smoothing: real  # s [s/m; s/rad for the moments]
+    regularizer: real  # ε [m/s; rad/s]
+    stiction: real  # v_s [m/s; rad/s], 0 where friction is smooth
 
 
 @wp.struct
 class PatchMotion:
-    """Motion of the first body relative to the second at a patch.
+    """Motion of the first body relative to the second at a patch."""
 
-    Attributes:
-        rate: Separating speed v_n [m/s].
-        slip: v_t [m/s].
-        drill: w_n n [rad/s].
-        roll: w_t [rad/s].
-    """
-
-    rate: real
-    slip: vec3
-    drill: vec3
-    roll: vec3
+    rate: real  # Separating speed v_n [m/s]
+    slip: vec3  # v_t [m/s]
+    drill: vec3  # w_n n [rad/s]
+    roll: vec3  # w_t [rad/s]
 
 
 @wp.struct
 class PatchDuals:
-    """Unknowns of friction that sticks besides the velocities.
+    """Unknowns of friction that sticks besides the velocities."""
 
-    Attributes:
-        slide: Sliding friction [N].
-        drill: Torsional friction [N m].
-        roll: Rolling friction [N m].
-    """
-
-    slide: vec3
-    drill: vec3
-    roll: vec3
+    slide: vec3  # Sliding friction [N]
+    drill: vec3  # Torsional friction [N m]
+    roll: vec3  # Rolling friction [N m]
 
 
 @wp.struct
 class NormalForce:
-    """Normal force.
+    """Normal force."""
 
-    Attributes:
-        size: F_n ≥ 0 [N].
-        damping: −∂F_n/∂v_n [N s/m].
-        sign: 1 where it pushes the bodies apart, −1 where an adhesive contact pulls.
-    """
-
-    size: real
-    damping: real
-    sign: real
+    size: real  # F_n ≥ 0 [N]
+    damping: real  # −∂F_n/∂v_n [N s/m]
+    sign: real  # 1 where it pushes the bodies apart, −1 where an adhesive contact pulls
 
 
 @wp.struct
 class PatchLinear:
-    """The law at given velocities, and its derivatives at given duals.
+    """The law at given velocities, and its derivatives at given duals."""
 
-    Attributes:
-        normal: Normal force.
-        slide: Sliding friction [N], without drag.
-        drill: Torsional friction [N m], without drag.
-        roll: Rolling friction [N m], without drag.
-        drag: F_n that drag is in proportion to [N].
-        drag_damping: −∂/∂v_n of it [N s/m].
-        held: Normal force whose friction bounds are held [N].
-    """
-
-    normal: NormalForce
-    slide: Friction
-    drill: Friction
-    roll: Friction
-    drag: real
-    drag_damping: real
-    held: real
+    normal: NormalForce  # Normal force
+    slide: Friction  # Sliding friction [N], without drag
+    drill: Friction  # Torsional friction [N m], without drag
+    roll: Friction  # Rolling friction [N m], without drag
+    drag: real  # F_n that drag is in proportion to [N]
+    drag_damping: real  # −∂/∂v_n of it [N s/m]
+    held: real  # Normal force whose friction bounds are held [N]
 
 
 @wp.struct
@@ -130,17 +87,11 @@ class PatchWrench:
 
 @wp.struct
 class PatchJacobian:
-    """Derivative of the wrench by the relative twist at χ; the force does not depend on the spin.
+    """Derivative of the wrench by the relative twist at χ; the force does not depend on the spin."""
 
-    Attributes:
-        force: Of the force by the velocity [N s/m].
-        moment: Of the moment by the velocity [N s].
-        turning: Of the moment by the spin [N m s].
-    """
-
-    force: mat33
-    moment: mat33
-    turning: mat33
+    force: mat33  # Of the force by the velocity [N s/m]
+    moment: mat33  # Of the moment by the velocity [N s]
+    turning: mat33  # Of the moment by the spin [N m s]
 
 
 @wp.func

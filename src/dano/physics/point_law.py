@@ -66,80 +66,47 @@ class Material:
 
 @wp.struct
 class PointLaw:
-    """What of the law does not change within a step.
+    """What of the law does not change within a step."""
 
-    Attributes:
-        stiffness: k [Pa/m].
-        depth: d [m].
-        damped: (ρ − σ) d⁺ [m].
-        lost: σ d⁺ [m].
-        ahead: θ h [s].
-        restitution_velocity: v_e, or the speed at which a deep overlap may separate, if larger [m/s].
-        friction: μ [1].
-        fading: φ [1].
-        friction_pressure: p₀ [Pa].
-        stiction: v_s [m/s].
-        gradual: v_g [m/s], zero where motion is looked for and no derivative.
-        sharp: 1 where the damping has its full size from v_e on, so that bodies are pushed apart no faster.
-        blow: κ w, pressure of an impact by the speed that is missing to its goal [Pa s/m].
-        goal: v*, separating speed that an impact aims at [m/s].
-        guard: κ [Pa s/m].
-        limit: Separating speed below which the point would get deeper than the impact [m/s].
-        numbers: Of a law of one's own; only where there is one.
-    """
-
-    stiffness: real
-    depth: real
-    damped: real
-    lost: real
-    ahead: real
-    restitution_velocity: real
-    friction: real
-    fading: real
-    friction_pressure: real
-    stiction: real
-    gradual: real
+    stiffness: real  # k [Pa/m]
+    depth: real  # d [m]
+    damped: real  # (ρ − σ) d⁺ [m]
+    lost: real  # σ d⁺ [m]
+    ahead: real  # θ h [s]
+    restitution_velocity: real  # v_e, or the speed at which a deep overlap may separate, if larger [m/s]
+    friction: real  # μ [1]
+    fading: real  # φ [1]
+    friction_pressure: real  # p₀ [Pa]
+    stiction: real  # v_s [m/s]
+    gradual: real  # v_g [m/s], zero where motion is looked for and no derivative
+    # 1 where the damping has its full size from v_e on, so that bodies are pushed apart no faster.
     sharp: real
-    blow: real
-    goal: real
-    guard: real
-    limit: real
+    blow: real  # κ w, pressure of an impact by the speed that is missing to its goal [Pa s/m]
+    goal: real  # v*, separating speed that an impact aims at [m/s]
+    guard: real  # κ [Pa s/m]
+    limit: real  # Separating speed below which the point would get deeper than the impact [m/s]
     if LAW:
-        numbers: vec3
+        numbers: vec3  # Of a law of one's own; only where there is one
 
 
 @wp.struct
 class Gate:
-    """Whether a point stays apart, in few numbers: of the points that are listed few press.
+    """Whether a point stays apart, in few numbers: of the points that are listed few press."""
 
-    Attributes:
-        normal: Of the point.
-        moment: Of a unit pressure at it [m].
-        rate: Separating speed from which on the point stays out [m/s], infinite where it is in.
-    """
-
-    normal: vec3
-    moment: vec3
-    rate: real
+    normal: vec3  # Of the point
+    moment: vec3  # Of a unit pressure at it [m]
+    rate: real  # Separating speed from which on the point stays out [m/s], infinite where it is in
 
 
 @wp.struct
 class Pressure:
-    """Pressure, and its derivatives.
+    """Pressure, and its derivatives."""
 
-    Attributes:
-        value: p [Pa].
-        damping: −∂p/∂v_n, s eliminated [Pa s/m].
-        direction_by_speed: ∂s/∂v_n [s/m].
-        direction_change: Change of s that makes it fit the velocity.
-        change: Change of the pressure that comes with it [Pa].
-    """
-
-    value: real
-    damping: real
-    direction_by_speed: real
-    direction_change: real
-    change: real
+    value: real  # p [Pa]
+    damping: real  # −∂p/∂v_n, s eliminated [Pa s/m]
+    direction_by_speed: real  # ∂s/∂v_n [s/m]
+    direction_change: real  # Change of s that makes it fit the velocity
+    change: real  # Change of the pressure that comes with it [Pa]
 
 
 @wp.struct
@@ -181,26 +148,16 @@ class Linear:
     The traction is p n + λ + friction_change, whatever the duals, and its derivative
 
         −f n dv_n + (b′ f dv_n) c − g du − l (û · du),    c = u / max(|u|, v_s).
-
-    Attributes:
-        pressure: p and its derivatives.
-        friction: λ, projected onto |λ| ≤ b(p) [Pa].
-        friction_change: Change of λ that makes it fit the velocities [Pa].
-        grip: g [Pa s/m].
-        turning: l [Pa s/m], zero where the point sticks.
-        slip_direction: û, unit slip, zero where the point sticks.
-        by_pressure: b′ f c [Pa s/m].
-        held: Largest friction that is held [Pa].
     """
 
-    pressure: Pressure
-    friction: vec3
-    friction_change: vec3
-    grip: real
-    turning: vec3
-    slip_direction: vec3
-    by_pressure: vec3
-    held: real
+    pressure: Pressure  # p and its derivatives
+    friction: vec3  # λ, projected onto |λ| ≤ b(p) [Pa]
+    friction_change: vec3  # Change of λ that makes it fit the velocities [Pa]
+    grip: real  # g [Pa s/m]
+    turning: vec3  # l [Pa s/m], zero where the point sticks
+    slip_direction: vec3  # û, unit slip, zero where the point sticks
+    by_pressure: vec3  # b′ f c [Pa s/m]
+    held: real  # Largest friction that is held [Pa]
 
 
 @wp.func

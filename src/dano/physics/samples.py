@@ -36,34 +36,24 @@ class Point:
 
     Geometry is that of the predicted configuration, moved back along with the first body's centre of mass, so
     that forces act on one line for both bodies.
-
-    Attributes:
-        arm: From the first body's centre of mass to the point [m].
-        normal: Unit normal out of the second body, toward the first.
-        moment: Moment of a unit pressure about the first body's centre of mass [m]: arm × normal, without
-            what a body that rolls on a smooth surface would feel of single samples.
-        extra_slip: What is added to the slip [m/s]: the part along the surface of half the change of the
-            point's velocity within the step, for samples that keep facing the second body.
-        depth: Below the second body's surface at the end of the step if nothing moved in it [m].
-        rate: Separating speed at the old velocities [m/s].
-        approach: Separating speed with which the step begins [m/s].
-        meets: Separating speed in the predicted configuration [m/s].
-        gains_after: What the separating speed at the end of the step gains from then on [m/s].
-        area: That faces the second body [m²].
-        sunk: Depth below the second body's surface in the predicted configuration [m], zero for a sample
-            that faces the other way.
     """
 
-    arm: vec3
-    normal: vec3
+    arm: vec3  # From the first body's centre of mass to the point [m]
+    normal: vec3  # Unit normal out of the second body, toward the first
+    # Moment of a unit pressure about the first body's centre of mass [m]: arm × normal, without what a body
+    # that rolls on a smooth surface would feel of single samples.
     moment: vec3
+    # What is added to the slip [m/s]: the part along the surface of half the change of the point's velocity
+    # within the step, for samples that keep facing the second body.
     extra_slip: vec3
-    depth: real
-    rate: real
-    approach: real
-    meets: real
-    gains_after: real
-    area: real
+    depth: real  # Below the second body's surface at the end of the step if nothing moved in it [m]
+    rate: real  # Separating speed at the old velocities [m/s]
+    approach: real  # Separating speed with which the step begins [m/s]
+    meets: real  # Separating speed in the predicted configuration [m/s]
+    gains_after: real  # What the separating speed at the end of the step gains from then on [m/s]
+    area: real  # That faces the second body [m²]
+    # Depth below the second body's surface in the predicted configuration [m], zero for a sample that faces
+    # the other way.
     sunk: real
 
 

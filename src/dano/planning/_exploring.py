@@ -40,15 +40,10 @@ _NEAR, _EFFORT = 0.1, 0.01
 
 
 class Reach(NamedTuple):
-    """A body that shall be touched.
+    """A body that shall be touched."""
 
-    Attributes:
-        body: That has a goal.
-        hand: Driven body that may touch it, or −1 if there is none.
-    """
-
-    body: int
-    hand: int
+    body: int  # That has a goal
+    hand: int  # Driven body that may touch it, or −1 if there is none
 
 
 def to_touch(scene: Scene, task: Task, states: State, engine: AbstractEngine) -> tuple[Reach, ...]:
@@ -111,31 +106,18 @@ def _hand(scene: Scene, body: int, driven: set[int], groups: list[int], states: 
 
 
 class _Search(NamedTuple):
-    """What a rollout along paths needs.
+    """What a rollout along paths needs."""
 
-    Attributes:
-        problem: The problem.
-        scene: The scene.
-        task: The task.
-        start: x_0.
-        hands: Driven bodies (static).
-        bodies: Those that they shall touch (static).
-        response: G⁺ [1/(m/s)], shape (m, hands · 3).
-        drift: B [m/s], shape (hands, 3).
-        first: Errors of the goals at the end without contact.
-        apart: First distances of hands and bodies [m].
-    """
-
-    problem: TrajectoryProblem
-    scene: Scene
-    task: Task
-    start: State
-    hands: tuple[int, ...]
-    bodies: tuple[int, ...]
-    response: Float[Array, "m n"]
-    drift: Float[Array, "k 3"]
-    first: list[Array]
-    apart: Float[Array, " k"]
+    problem: TrajectoryProblem  # The problem
+    scene: Scene  # The scene
+    task: Task  # The task
+    start: State  # x_0
+    hands: tuple[int, ...]  # Driven bodies (static)
+    bodies: tuple[int, ...]  # Those that they shall touch (static)
+    response: Float[Array, "m n"]  # G⁺ [1/(m/s)], shape (m, hands · 3)
+    drift: Float[Array, "k 3"]  # B [m/s], shape (hands, 3)
+    first: list[Array]  # Errors of the goals at the end without contact
+    apart: Float[Array, " k"]  # First distances of hands and bodies [m]
 
 
 def explored(

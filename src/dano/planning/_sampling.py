@@ -75,21 +75,13 @@ class SamplingOptions:
 
 
 class Sampled(NamedTuple):
-    """The best sequence of a search.
+    """The best sequence of a search."""
 
-    Attributes:
-        controls: w, shape (T, m).
-        cost: Its priced cost.
-        history: Best priced cost after each pass.
-        seconds: [s].
-        interrupted: Whether Ctrl-C or the time limit ended it.
-    """
-
-    controls: Float[Array, "T m"]
-    cost: float
-    history: np.ndarray
-    seconds: float
-    interrupted: bool
+    controls: Float[Array, "T m"]  # w, shape (T, m)
+    cost: float  # Its priced cost
+    history: np.ndarray  # Best priced cost after each pass
+    seconds: float  # [s]
+    interrupted: bool  # Whether Ctrl-C or the time limit ended it
 
 
 def sampled(

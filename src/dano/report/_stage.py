@@ -41,17 +41,11 @@ def check_run(scene: Scene, trajectory: Trajectory, name: str = "trajectory") ->
 
 
 class Stage(NamedTuple):
-    """What of a scene is drawn.
+    """What of a scene is drawn."""
 
-    Attributes:
-        items: One per drawable body, at the identity.
-        rows: Index of the body of each item.
-        offsets: Centre of mass in the field frame [m, F] of each item.
-    """
-
-    items: list[Item]
-    rows: list[int]
-    offsets: list[np.ndarray]
+    items: list[Item]  # One per drawable body, at the identity
+    rows: list[int]  # Index of the body of each item
+    offsets: list[np.ndarray]  # Centre of mass in the field frame [m, F] of each item
 
     def posed(
         self, position: Float[np.ndarray, "bodies 3"], orientation: Float[np.ndarray, "bodies 4"]
@@ -117,19 +111,14 @@ def object_level(density_range: np.ndarray) -> float:
 
 
 class Touches(NamedTuple):
-    """Contact forces at the times of frames.
+    """Contact forces at the times of frames."""
 
-    Attributes:
-        points: Centroids of the overlaps [m, W], (frames, contacts, 3).
-        forces: On the first body of each contact [N, W], (frames, contacts, 3).
-        shares: Force over the usual one, (frames, contacts); zero where nothing touches.
-        usual: Usual force [N], for arrows; zero if nothing touches at all.
-    """
-
-    points: Float[np.ndarray, "frames contacts 3"]
+    points: Float[np.ndarray, "frames contacts 3"]  # Centroids of the overlaps [m, W], (frames, contacts, 3)
+    # On the first body of each contact [N, W], (frames, contacts, 3).
     forces: Float[np.ndarray, "frames contacts 3"]
+    # Force over the usual one, (frames, contacts); zero where nothing touches.
     shares: Float[np.ndarray, "frames contacts"]
-    usual: float
+    usual: float  # Usual force [N], for arrows; zero if nothing touches at all
 
     def beside(self, usual: float) -> "Touches":
         """The same with another usual force, so that arrows can be compared with those of other runs."""

@@ -100,27 +100,16 @@ class VideoOptions:
 
 
 class Take(NamedTuple):
-    """A run as a film shows it: what is drawn of it, and where that is in each frame.
+    """A run as a film shows it: what is drawn of it, and where that is in each frame."""
 
-    Attributes:
-        seen: What the camera keeps in view.
-        drawn: Bodies.
-        times: Of the frames [s].
-        position: Of the centres of mass [m, W].
-        orientation: Of the bodies.
-        touched: Contacts; None if they are not drawn.
-        label: Written in a corner, if it is not empty.
-        ghosts: Drawn through, and over all.
-    """
-
-    seen: Seen
-    drawn: Stage
-    times: Float[np.ndarray, " frames"]
-    position: Float[np.ndarray, "frames bodies 3"]
-    orientation: Float[np.ndarray, "frames bodies 4"]
-    touched: Touches | None
-    label: str = ""
-    ghosts: Sequence[Item] = ()
+    seen: Seen  # What the camera keeps in view
+    drawn: Stage  # Bodies
+    times: Float[np.ndarray, " frames"]  # Of the frames [s]
+    position: Float[np.ndarray, "frames bodies 3"]  # Of the centres of mass [m, W]
+    orientation: Float[np.ndarray, "frames bodies 4"]  # Of the bodies
+    touched: Touches | None  # Contacts; None if they are not drawn
+    label: str = ""  # Written in a corner, if it is not empty
+    ghosts: Sequence[Item] = ()  # Drawn through, and over all
 
 
 def render_trajectory(

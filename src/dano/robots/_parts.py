@@ -35,21 +35,13 @@ FLOATING = "floating"
 
 
 class Parts(NamedTuple):
-    """A description, and what follows from it before there are bodies.
+    """A description, and what follows from it before there are bodies."""
 
-    Attributes:
-        description: The file, without what is left out.
-        groups: Links that move as one.
-        places: Where each group stands in the pose of the file [W].
-        fixed: Groups that never move.
-        free: Groups that move freely.
-    """
-
-    description: Description
-    groups: dict[str, dict[str, Placed]]
-    places: dict[str, Placed]
-    fixed: frozenset[str]
-    free: frozenset[str]
+    description: Description  # The file, without what is left out
+    groups: dict[str, dict[str, Placed]]  # Links that move as one
+    places: dict[str, Placed]  # Where each group stands in the pose of the file [W]
+    fixed: frozenset[str]  # Groups that never move
+    free: frozenset[str]  # Groups that move freely
 
 
 def checked_base(base: Pose | str | None, description: Description) -> Placed | None:

@@ -32,15 +32,10 @@ numbers are leaves of the scene; `Others` holds those of thousands in arrays."""
 
 
 class OnPlanes(NamedTuple):
-    """Parameters of each body where edges and faces meet a plane, arrays of shape (n,).
+    """Parameters of each body where edges and faces meet a plane, arrays of shape (n,)."""
 
-    Attributes:
-        stiffness: k [Pa/m].
-        impact_depth: δ [m].
-    """
-
-    stiffness: Float[Array, " n"]
-    impact_depth: Float[Array, " n"]
+    stiffness: Float[Array, " n"]  # k [Pa/m]
+    impact_depth: Float[Array, " n"]  # δ [m]
 
 
 class Others(eqx.Module):

@@ -40,17 +40,11 @@ class Finding(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """Largest motion of a body, see the module.
+    """Largest motion of a body, see the module."""
 
-    Attributes:
-        speed: Of its centre of mass [m/s].
-        spin: [rad/s].
-        falls: Whether nothing that it may touch is fixed below it.
-    """
-
-    speed: float
-    spin: float
-    falls: bool
+    speed: float  # Of its centre of mass [m/s]
+    spin: float  # [rad/s]
+    falls: bool  # Whether nothing that it may touch is fixed below it
 
 
 def bounds(scene: Scene, state: State, duration: float) -> list[Bound]:

@@ -21,17 +21,11 @@ _FILE = "{file}"
 
 
 class Built(NamedTuple):
-    """An object of a file.
+    """An object of a file."""
 
-    Attributes:
-        made: The object.
-        of_shape: Whether the file holds a shape, as meshes do.
-        said: What was found odd when it was built.
-    """
-
-    made: NeuralObject
-    of_shape: bool
-    said: list[str]
+    made: NeuralObject  # The object
+    of_shape: bool  # Whether the file holds a shape, as meshes do
+    said: list[str]  # What was found odd when it was built
 
 
 _built: dict[object, Built] = {}

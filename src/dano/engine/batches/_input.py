@@ -24,27 +24,16 @@ _COLUMNS = 32
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """Checked arguments of `rollouts`.
+    """Checked arguments of `rollouts`."""
 
-    Attributes:
-        program: What to compile.
-        shared: Arrays of `Inputs` that all rollouts share.
-        rows: Arrays of `Inputs` with a leading axis of rollouts, on the host.
-        n_rollouts: Their number.
-        keep: Which states are kept, as it was given.
-        steps: After how many steps each of them stands.
-        names: Names of the bodies.
-        inputs: All that was given.
-    """
-
-    program: Program
-    shared: Any
-    rows: Any
-    n_rollouts: int
-    keep: str | int
-    steps: np.ndarray
-    names: tuple[str, ...]
-    inputs: Inputs
+    program: Program  # What to compile
+    shared: Any  # Arrays of `Inputs` that all rollouts share
+    rows: Any  # Arrays of `Inputs` with a leading axis of rollouts, on the host
+    n_rollouts: int  # Their number
+    keep: str | int  # Which states are kept, as it was given
+    steps: np.ndarray  # After how many steps each of them stands
+    names: tuple[str, ...]  # Names of the bodies
+    inputs: Inputs  # All that was given
 
     @property
     def row_bytes(self) -> int:

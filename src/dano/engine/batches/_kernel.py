@@ -28,19 +28,12 @@ class Kept(NamedTuple):
 
 
 class Program(NamedTuple):
-    """The static part of a simulation; it decides the compiled program.
+    """The static part of a simulation; it decides the compiled program."""
 
-    Attributes:
-        static: What is not an array of scene, parameters, state, controls and engine.
-        n_steps: Number of steps.
-        every: Steps between kept states; `n_steps` to keep the last alone.
-        first: Whether the initial state is kept.
-    """
-
-    static: Any
-    n_steps: int
-    every: int
-    first: bool
+    static: Any  # What is not an array of scene, parameters, state, controls and engine
+    n_steps: int  # Number of steps
+    every: int  # Steps between kept states; `n_steps` to keep the last alone
+    first: bool  # Whether the initial state is kept
 
 
 class Inputs(NamedTuple):

@@ -41,17 +41,11 @@ _KNOWN, _PRESSES = wp.constant(1), wp.constant(2)
 
 @wp.struct
 class Fit:
-    """How well duals fit, in shares of all pressure.
+    """How well duals fit, in shares of all pressure."""
 
-    Attributes:
-        unfit: What friction and pressure of single points miss [N s].
-        push: All pressure [N s].
-        renewed: By how much held friction bounds changed [N s].
-    """
-
-    unfit: real
-    push: real
-    renewed: real
+    unfit: real  # What friction and pressure of single points miss [N s]
+    push: real  # All pressure [N s]
+    renewed: real  # By how much held friction bounds changed [N s]
 
 
 @wp.struct
@@ -79,19 +73,12 @@ class Halves:
 
 @wp.struct
 class Trial:
-    """What a pass tries.
+    """What a pass tries."""
 
-    Attributes:
-        length: Share of Newton's step.
-        softness: Multiplies the stiction velocity.
-        holds: Whether friction bounds are held.
-        mix: Share of them that is renewed.
-    """
-
-    length: real
-    softness: real
-    holds: bool
-    mix: real
+    length: real  # Share of Newton's step
+    softness: real  # Multiplies the stiction velocity
+    holds: bool  # Whether friction bounds are held
+    mix: real  # Share of them that is renewed
 
 
 @wp.func

@@ -62,19 +62,12 @@ class Meeting:
 
 @wp.struct
 class Nearing:
-    """How a point nears a solid within a step.
+    """How a point nears a solid within a step."""
 
-    Attributes:
-        left: Way that is left to the depth at which bodies meet [m].
-        near: How far it nears the solid in a step, at the moment [m].
-        counts: By more than so much in a step where it counts [m].
-        at_old: How far it would near it if its velocity gained nothing [m].
-    """
-
-    left: real
-    near: real
-    counts: real
-    at_old: real
+    left: real  # Way that is left to the depth at which bodies meet [m]
+    near: real  # How far it nears the solid in a step, at the moment [m]
+    counts: real  # By more than so much in a step where it counts [m]
+    at_old: real  # How far it would near it if its velocity gained nothing [m]
 
 
 @wp.func
@@ -125,48 +118,28 @@ def soonest(left: real, near: real, bend: real, slow: real) -> real:
 
 @wp.struct
 class Ask:
-    """What is asked of samples at a moment.
+    """What is asked of samples at a moment."""
 
-    Attributes:
-        sink: Depth at which bodies meet [m].
-        h: Timestep [s].
-        slow: What nears the solid by no more in a step does not count [m].
-        most: By no more does anything near it in a step [m].
-        bend: By how much that grows in a step at most [m].
-        rest: Share of the step that is left.
-        turning: How samples turn.
-        stretch: Largest factor by which sample coordinates are enlarged.
-        plane: What they near, if it is a plane.
-    """
-
-    sink: real
-    h: real
-    slow: real
-    most: real
-    bend: real
-    rest: real
-    turning: int
-    stretch: real
-    plane: Plane
+    sink: real  # Depth at which bodies meet [m]
+    h: real  # Timestep [s]
+    slow: real  # What nears the solid by no more in a step does not count [m]
+    most: real  # By no more does anything near it in a step [m]
+    bend: real  # By how much that grows in a step at most [m]
+    rest: real  # Share of the step that is left
+    turning: int  # How samples turn
+    stretch: real  # Largest factor by which sample coordinates are enlarged
+    plane: Plane  # What they near, if it is a plane
 
 
 @wp.struct
 class Soonest:
-    """The sample that meets the solid first, and what else samples say that were asked.
+    """The sample that meets the solid first, and what else samples say that were asked."""
 
-    Attributes:
-        further: Share of the step until it may.
-        critical: The sample, −1 where none does within the step.
-        block: Share of the step until one of the block that was looked at last may.
-        fastest: Most by which one nears the solid in a step [m].
-        close: Least distance that one may have by the end of the step [m].
-    """
-
-    further: real
-    critical: int
-    block: real
-    fastest: real
-    close: real
+    further: real  # Share of the step until it may
+    critical: int  # The sample, −1 where none does within the step
+    block: real  # Share of the step until one of the block that was looked at last may
+    fastest: real  # Most by which one nears the solid in a step [m]
+    close: real  # Least distance that one may have by the end of the step [m]
 
 
 @wp.func

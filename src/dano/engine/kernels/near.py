@@ -26,15 +26,10 @@ def stretch_of(body: Body, turning: int) -> real:
 
 @wp.struct
 class Plane:
-    """What a body nears, if it is a plane.
+    """What a body nears, if it is a plane."""
 
-    Attributes:
-        is_one: Whether it is one, and samples are fixed to the body.
-        normal: Unit normal in the axes of the solid.
-    """
-
-    is_one: bool
-    normal: vec3
+    is_one: bool  # Whether it is one, and samples are fixed to the body
+    normal: vec3  # Unit normal in the axes of the solid
 
 
 @wp.func

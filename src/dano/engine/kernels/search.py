@@ -73,19 +73,12 @@ def list_point(
 
 @wp.struct
 class BlockShare:
-    """What a lane takes of the blocks that are listed in a round.
+    """What a lane takes of the blocks that are listed in a round."""
 
-    Attributes:
-        block: Number of a block in the round.
-        begin: First of its samples that the lane takes.
-        count: How many.
-        rest: Bits of the blocks that are left.
-    """
-
-    block: int
-    begin: int
-    count: int
-    rest: wp.uint32
+    block: int  # Number of a block in the round
+    begin: int  # First of its samples that the lane takes
+    count: int  # How many
+    rest: wp.uint32  # Bits of the blocks that are left
 
 
 @wp.func

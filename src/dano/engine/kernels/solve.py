@@ -69,89 +69,53 @@ _STICTION = wp.constant(real(1e-7))
 
 @wp.struct
 class Options:
-    """When a solve stops.
+    """When a solve stops."""
 
-    Attributes:
-        tolerance: Residual over (1 + size) that counts as solved.
-        rounding: Of the numbers.
-        fit: What duals may miss, in shares of all pressure.
-        max_passes: Passes after which a solve gives up.
-    """
-
-    tolerance: real
-    rounding: real
-    fit: real
-    max_passes: int
+    tolerance: real  # Residual over (1 + size) that counts as solved
+    rounding: real  # Of the numbers
+    fit: real  # What duals may miss, in shares of all pressure
+    max_passes: int  # Passes after which a solve gives up
 
 
 @wp.struct
 class Level:
-    """How a level of a solve is solved.
+    """How a level of a solve is solved."""
 
-    Attributes:
-        softness: Multiplies the stiction velocity.
-        share: Of a step that is taken.
-        searches: Whether a line search runs.
-        budget: Passes.
-        holds: Whether friction bounds are held.
-    """
-
-    softness: real
-    share: real
-    searches: bool
-    budget: int
-    holds: bool
+    softness: real  # Multiplies the stiction velocity
+    share: real  # Of a step that is taken
+    searches: bool  # Whether a line search runs
+    budget: int  # Passes
+    holds: bool  # Whether friction bounds are held
 
 
 @wp.struct
 class Search:
-    """A line search along Newton's step, for a zero of the work of the residual along it.
+    """A line search along Newton's step, for a zero of the work of the residual along it."""
 
-    Attributes:
-        begun: Work at the accepted point.
-        length: Share of the step to try.
-        low: Largest share known to be too short, and the work there.
-        low_work: …
-        high: Smallest share known to be too long, 0 if none, and the work there.
-        high_work: …
-    """
-
-    begun: real
-    length: real
-    low: real
-    low_work: real
-    high: real
-    high_work: real
+    begun: real  # Work at the accepted point
+    length: real  # Share of the step to try
+    low: real  # Largest share known to be too short, and the work there
+    low_work: real  # …
+    high: real  # Smallest share known to be too long, 0 if none, and the work there
+    high_work: real  # …
 
 
 @wp.struct
 class Measured:
-    """What a pass finds.
+    """What a pass finds."""
 
-    Attributes:
-        work: Of the residual along the step.
-        error: Largest residual over mass or inertia [m/s, rad/s].
-        size: Largest sum of the terms of a row of the Jacobian [m/s].
-    """
-
-    work: real
-    error: real
-    size: real
+    work: real  # Of the residual along the step
+    error: real  # Largest residual over mass or inertia [m/s, rad/s]
+    size: real  # Largest sum of the terms of a row of the Jacobian [m/s]
 
 
 @wp.struct
 class Solved:
-    """How a solve ended.
+    """How a solve ended."""
 
-    Attributes:
-        residual: Largest residual over mass or inertia [m/s, rad/s].
-        passes: How many it took.
-        converged: Whether it converged.
-    """
-
-    residual: real
-    passes: int
-    converged: bool
+    residual: real  # Largest residual over mass or inertia [m/s, rad/s]
+    passes: int  # How many it took
+    converged: bool  # Whether it converged
 
 
 @wp.func

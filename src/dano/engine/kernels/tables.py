@@ -49,46 +49,27 @@ class Body:
 
 @wp.struct
 class BodyIndex:
-    """Whole numbers of a body.
+    """Whole numbers of a body."""
 
-    Attributes:
-        row: Place among the bodies that move, or −1; of bodies on joints their node.
-        first_block: Of its samples.
-        blocks: How many it has.
-        turning: How its samples turn.
-        first_leaf: Of its solid.
-        leaves: How many its solid has.
-    """
-
-    row: wp.int32
-    first_block: wp.int32
-    blocks: wp.int32
-    turning: wp.int32
-    first_leaf: wp.int32
-    leaves: wp.int32
+    row: wp.int32  # Place among the bodies that move, or −1; of bodies on joints their node
+    first_block: wp.int32  # Of its samples
+    blocks: wp.int32  # How many it has
+    turning: wp.int32  # How its samples turn
+    first_leaf: wp.int32  # Of its solid
+    leaves: wp.int32  # How many its solid has
 
 
 @wp.struct
 class SamplePair:
-    """Samples of one body (first) that may press on the solid of another (second).
+    """Samples of one body (first) that may press on the solid of another (second)."""
 
-    Attributes:
-        share: Share of the contact's stiffness that this pair carries [1].
-        follows: 1 where points follow the second body, which rolls on the first, else 0.
-        sink: Depth up to which predicted geometry is taken [m].
-        impact_depth: δ, depth of an impact [m].
-        factor: F of its damper, see `dano.physics.impacts.Impact` [1].
-        deepest: Depth that no part gets beyond within a step with an impact of another part [m].
-        margin: Distance within which samples count as near [m].
-    """
-
-    share: real
-    follows: real
-    sink: real
-    impact_depth: real
-    factor: real
-    deepest: real
-    margin: real
+    share: real  # Share of the contact's stiffness that this pair carries [1]
+    follows: real  # 1 where points follow the second body, which rolls on the first, else 0
+    sink: real  # Depth up to which predicted geometry is taken [m]
+    impact_depth: real  # δ, depth of an impact [m]
+    factor: real  # F of its damper, see `dano.physics.impacts.Impact` [1]
+    deepest: real  # Depth that no part gets beyond within a step with an impact of another part [m]
+    margin: real  # Distance within which samples count as near [m]
 
 
 @wp.struct
@@ -162,21 +143,13 @@ class Push:
 
 @wp.struct
 class StepReport:
-    """What a step says of itself.
+    """What a step says of itself."""
 
-    Attributes:
-        residual: Largest that is left of the equations over mass or inertia [m/s, rad/s].
-        passes: Of the solver.
-        solved: 1 where the equations were solved.
-        overflow: 1 where more points touch than there is room for.
-        rebound: Share of the restitution with which contact adds no energy.
-    """
-
-    residual: real
-    passes: real
-    solved: real
-    overflow: real
-    rebound: real
+    residual: real  # Largest that is left of the equations over mass or inertia [m/s, rad/s]
+    passes: real  # Of the solver
+    solved: real  # 1 where the equations were solved
+    overflow: real  # 1 where more points touch than there is room for
+    rebound: real  # Share of the restitution with which contact adds no energy
 
 
 @wp.struct
@@ -190,33 +163,19 @@ class FoundPoint:
 
 @wp.struct
 class FoundPair:
-    """A pair that is near in a step.
+    """A pair that is near in a step."""
 
-    Attributes:
-        pair: Index among the pairs.
-        first: First of its points in a lane's list.
-        end: Beyond its last.
-        critical: Sample that says when the bodies meet, −1 where they do not within the step.
-        share: τ.
-        hits: 1 where τ is when the bodies are as deep as in an impact.
-        falls: 1 where bodies fall freely until they meet: then gravity takes part in their way.
-        impact: Of the pair.
-        patch: Its samples that have sunk in.
-        toward: Direction that samples which turn face [F].
-        com_difference: From the second body's centre of mass to the first's [m, W].
-    """
-
-    pair: wp.int32
-    first: wp.int32
-    end: wp.int32
-    critical: wp.int32
-    share: real
-    hits: wp.int32
-    falls: wp.int32
-    impact: Impact
-    patch: Patch
-    toward: vec3
-    com_difference: vec3
+    pair: wp.int32  # Index among the pairs
+    first: wp.int32  # First of its points in a lane's list
+    end: wp.int32  # Beyond its last
+    critical: wp.int32  # Sample that says when the bodies meet, −1 where they do not within the step
+    share: real  # τ
+    hits: wp.int32  # 1 where τ is when the bodies are as deep as in an impact
+    falls: wp.int32  # 1 where bodies fall freely until they meet: then gravity takes part in their way
+    impact: Impact  # Of the pair
+    patch: Patch  # Its samples that have sunk in
+    toward: vec3  # Direction that samples which turn face [F]
+    com_difference: vec3  # From the second body's centre of mass to the first's [m, W]
 
 
 @wp.struct

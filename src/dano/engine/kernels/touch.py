@@ -20,30 +20,19 @@ _LANES, _REBOUNDS = wp.constant(LANES), wp.constant(REBOUNDS)
 
 @wp.struct
 class Overlap:
-    """How a pair of `Scene.pair_index` overlaps, as sums over points at depths d, with areas A.
+    """How a pair of `Scene.pair_index` overlaps, as sums over points at depths d, with areas A."""
 
-    Attributes:
-        volume: Σ A d [m³].
-        moment: Σ A d x [m⁴, W].
-        direction: Σ A d n [m³, W]: the direction in which the first body is pushed.
-    """
-
-    volume: real
-    moment: vec3
-    direction: vec3
+    volume: real  # Σ A d [m³]
+    moment: vec3  # Σ A d x [m⁴, W]
+    direction: vec3  # Σ A d n [m³, W]: the direction in which the first body is pushed
 
 
 @wp.struct
 class Wrench:
-    """What pushes the first body of a pair of `Scene.pair_index`.
+    """What pushes the first body of a pair of `Scene.pair_index`."""
 
-    Attributes:
-        force: [N, W].
-        torque: About its centre of mass [N m, W].
-    """
-
-    force: vec3
-    torque: vec3
+    force: vec3  # [N, W]
+    torque: vec3  # About its centre of mass [N m, W]
 
 
 @wp.struct

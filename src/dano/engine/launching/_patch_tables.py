@@ -41,41 +41,24 @@ _OWN_DIRECTION = (Sphere, Capsule, Ellipsoid)
 
 
 class PatchPair(NamedTuple):
-    """A contact with a patch law.
+    """A contact with a patch law."""
 
-    Attributes:
-        first: Index of the body that the wrench acts on.
-        second: Index of the other body.
-        a: The first body; its pose is not read.
-        b: The second body.
-        params: Parameters of the law.
-        law: The law.
-    """
-
-    first: int
-    second: int
-    a: Collider
-    b: Collider
-    params: ContactParams
-    law: AbstractPatchLaw
+    first: int  # Index of the body that the wrench acts on
+    second: int  # Index of the other body
+    a: Collider  # The first body; its pose is not read
+    b: Collider  # The second body
+    params: ContactParams  # Parameters of the law
+    law: AbstractPatchLaw  # The law
 
 
 class PatchTables(NamedTuple):
-    """Contacts with a patch law for kernels.
+    """Contacts with a patch law for kernels."""
 
-    Attributes:
-        rows: Real numbers by place in a kernel's parameters.
-        whole: Whole numbers by place.
-        leaves: Leaves for `scene.solids`, behind those that stand there already.
-        pair_index: Rows for `scene.pair_index`, behind those of pairs with samples that press.
-        unions: Whether a field has several parts, or a part several leaves.
-    """
-
-    rows: dict[str, Array]
-    whole: dict[str, np.ndarray]
-    leaves: list[Placed]
-    pair_index: np.ndarray
-    unions: bool
+    rows: dict[str, Array]  # Real numbers by place in a kernel's parameters
+    whole: dict[str, np.ndarray]  # Whole numbers by place
+    leaves: list[Placed]  # Leaves for `scene.solids`, behind those that stand there already
+    pair_index: np.ndarray  # Rows for `scene.pair_index`, behind those of pairs with samples that press
+    unions: bool  # Whether a field has several parts, or a part several leaves
 
 
 class _Part(NamedTuple):

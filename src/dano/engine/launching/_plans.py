@@ -17,15 +17,10 @@ class Shape(NamedTuple):
 
 
 class Build(NamedTuple):
-    """What a kernel is built for.
+    """What a kernel is built for."""
 
-    Attributes:
-        lanes: Lanes of a world.
-        wide: Whether numbers have 64 bits.
-    """
-
-    lanes: int
-    wide: bool
+    lanes: int  # Lanes of a world
+    wide: bool  # Whether numbers have 64 bits
 
 
 class OfWidth(NamedTuple):

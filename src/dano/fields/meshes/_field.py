@@ -46,17 +46,12 @@ _CLEAR = 0.1
 
 
 class _Solid(NamedTuple):
-    """A mesh as solids whose union it is.
+    """A mesh as solids whose union it is."""
 
-    Attributes:
-        whole: All faces, outward.
-        parts: Meshes whose shells lie in boxes of their own; parts may overlap each other.
-        turned: How many shells were inside out.
-    """
-
-    whole: "trimesh.Trimesh"
+    whole: "trimesh.Trimesh"  # All faces, outward
+    # Meshes whose shells lie in boxes of their own; parts may overlap each other.
     parts: "list[trimesh.Trimesh]"
-    turned: int
+    turned: int  # How many shells were inside out
 
 
 def mesh_field(

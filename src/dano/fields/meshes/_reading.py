@@ -38,17 +38,11 @@ _FLAT, _STANDS = 1e-4, 0.2
 
 
 class RawMesh(NamedTuple):
-    """A mesh as its file has it, in metres.
+    """A mesh as its file has it, in metres."""
 
-    Attributes:
-        name: Of the file, for messages.
-        vertices: [m], shape (v, 3).
-        faces: Shape (f, 3).
-    """
-
-    name: str
-    vertices: np.ndarray
-    faces: np.ndarray
+    name: str  # Of the file, for messages
+    vertices: np.ndarray  # [m], shape (v, 3)
+    faces: np.ndarray  # Shape (f, 3)
 
 
 def checked_units(scale: int | float | None, units: str | None) -> float | None:

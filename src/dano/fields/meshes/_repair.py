@@ -24,25 +24,15 @@ _MOST_DOUBT = 0.4
 
 
 class Repaired(NamedTuple):
-    """A closed mesh.
+    """A closed mesh."""
 
-    Attributes:
-        vertices: Shape (v, 3).
-        faces: Shape (f, 3).
-        labels: Shell of each face, shape (f,): each is closed on its own.
-        doubt: Share of the area that was added to close holes.
-        notes: What was repaired, in words.
-        is_crossed: Faces may lie within the solid: walls between parts that touch, or what was added.
-        is_smooth: Two faces meet at each edge, and all have normals: these tell which side is inside.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    labels: np.ndarray
-    doubt: float
-    notes: list[str]
-    is_crossed: bool
-    is_smooth: bool
+    vertices: np.ndarray  # Shape (v, 3)
+    faces: np.ndarray  # Shape (f, 3)
+    labels: np.ndarray  # Shell of each face, shape (f,): each is closed on its own
+    doubt: float  # Share of the area that was added to close holes
+    notes: list[str]  # What was repaired, in words
+    is_crossed: bool  # Faces may lie within the solid: walls between parts that touch, or what was added
+    is_smooth: bool  # Two faces meet at each edge, and all have normals: these tell which side is inside
 
 
 def repaired(vertices: np.ndarray, faces: np.ndarray, igl: Any) -> Repaired:

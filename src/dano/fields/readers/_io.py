@@ -29,17 +29,11 @@ from dano.names import did_you_mean
 
 
 class _Reader(NamedTuple):
-    """How a kind of file is read.
+    """How a kind of file is read."""
 
-    Attributes:
-        read: Takes the path and the options.
-        options: Names of the options.
-        crops: Whether it takes `crop` itself.
-    """
-
-    read: Callable[..., AbstractField]
-    options: tuple[str, ...] = ()
-    crops: bool = False
+    read: Callable[..., AbstractField]  # Takes the path and the options
+    options: tuple[str, ...] = ()  # Names of the options
+    crops: bool = False  # Whether it takes `crop` itself
 
 
 _CHECKPOINT = (

@@ -26,23 +26,15 @@ SETTINGS, TRANSFORMS = "config.yml", "dataparser_transforms.json"
 
 
 class HashDensity(eqx.Module):
-    """Density of a hash-grid radiance field: factor · exp(first output of a ReLU network of the features).
+    """Density of a hash-grid radiance field: factor · exp(first output of a ReLU network of the features)."""
 
-    Attributes:
-        grid: The encoding.
-        weights: Matrices of the network, (outputs, inputs) each.
-        biases: Their biases; zeros for tiny-cuda-nn, which has none.
-        box: Lower corner and size of the box that is mapped onto the unit cube, shape (2, 3).
-        factor: Scale of the density.
-        contracted: Whether space is contracted into [−2, 2]³ first (static).
-    """
-
-    grid: HashGrid
-    weights: tuple[Float[Array, "_ _"], ...]
-    biases: tuple[Float[Array, " _"], ...]
+    grid: HashGrid  # The encoding
+    weights: tuple[Float[Array, "_ _"], ...]  # Matrices of the network, (outputs, inputs) each
+    biases: tuple[Float[Array, " _"], ...]  # Their biases; zeros for tiny-cuda-nn, which has none
+    # Lower corner and size of the box that is mapped onto the unit cube, shape (2, 3).
     box: Float[Array, "2 3"]
-    factor: float
-    contracted: bool = eqx.field(static=True)
+    factor: float  # Scale of the density
+    contracted: bool = eqx.field(static=True)  # Whether space is contracted into [−2, 2]³ first (static)
 
     def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Density at points in the frame of training."""

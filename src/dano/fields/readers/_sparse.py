@@ -23,23 +23,15 @@ class Block(NamedTuple):
 
 
 class SparseGrid(NamedTuple):
-    """A grid as it stands in a file.
+    """A grid as it stands in a file."""
 
-    Attributes:
-        name: Of the grid.
-        kind: "fog volume", "level set", or another class, possibly "".
-        matrix: Index (i, j, k) to the file's world: x = matrix @ index + offset, shape (3, 3).
-        offset: Shape (3,).
-        background: Value outside of all blocks.
-        blocks: Leaves and tiles.
-    """
-
-    name: str
-    kind: str
+    name: str  # Of the grid
+    kind: str  # "fog volume", "level set", or another class, possibly ""
+    # Index (i, j, k) to the file's world: x = matrix @ index + offset, shape (3, 3).
     matrix: Float[np.ndarray, "3 3"]
-    offset: Float[np.ndarray, "3"]
-    background: float
-    blocks: list[Block]
+    offset: Float[np.ndarray, "3"]  # Shape (3,)
+    background: float  # Value outside of all blocks
+    blocks: list[Block]  # Leaves and tiles
 
 
 Rows = list[tuple[str, str, SparseGrid | None]]

@@ -48,25 +48,15 @@ _TABLES = (".csv", ".txt", ".tum")
 
 
 class _Read(NamedTuple):
-    """What a file holds.
+    """What a file holds."""
 
-    Attributes:
-        arrays: Times and quantities, and what `Motion.create` takes beside them.
-        names: Of the bodies; () if it does not say.
-        time_unit: Seconds in the unit of its times; None if that is not known.
-        units: SI units in those of its quantities, where these are known.
-        first: What was taken from the times already.
-        order: Of its quaternions; None if that is not known.
-        notes: What to say of it.
-    """
-
-    arrays: dict[str, np.ndarray]
-    names: tuple[str, ...]
-    time_unit: float | None
-    units: dict[str, float]
-    first: int
-    order: str | None
-    notes: list[str]
+    arrays: dict[str, np.ndarray]  # Times and quantities, and what `Motion.create` takes beside them
+    names: tuple[str, ...]  # Of the bodies; () if it does not say
+    time_unit: float | None  # Seconds in the unit of its times; None if that is not known
+    units: dict[str, float]  # SI units in those of its quantities, where these are known
+    first: int  # What was taken from the times already
+    order: str | None  # Of its quaternions; None if that is not known
+    notes: list[str]  # What to say of it
 
 
 def load_motion(

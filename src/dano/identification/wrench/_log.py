@@ -125,21 +125,13 @@ class WristLog:
 
 
 class Twists(NamedTuple):
-    """How the sensor moved, in its axes, at rows where that is known.
+    """How the sensor moved, in its axes, at rows where that is known."""
 
-    Attributes:
-        rows: Of the log.
-        acceleration: Of the sensor's origin [m/s², S], shape (n, 3).
-        turn: Orientations there, S → W, shape (n, 4).
-        omega: [rad/s, S].
-        alpha: Its rate [rad/s², S].
-    """
-
-    rows: np.ndarray
-    acceleration: np.ndarray
-    turn: np.ndarray
-    omega: np.ndarray
-    alpha: np.ndarray
+    rows: np.ndarray  # Of the log
+    acceleration: np.ndarray  # Of the sensor's origin [m/s², S], shape (n, 3)
+    turn: np.ndarray  # Orientations there, S → W, shape (n, 4)
+    omega: np.ndarray  # [rad/s, S]
+    alpha: np.ndarray  # Its rate [rad/s², S]
 
 
 def twists(log: WristLog) -> Twists:

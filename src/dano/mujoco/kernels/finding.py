@@ -43,23 +43,14 @@ _MET = wp.constant(real(1e-9))
 
 @wp.struct
 class Side:
-    """One of two parts whose samples are asked, and the other that they are asked against.
+    """One of two parts whose samples are asked, and the other that they are asked against."""
 
-    Attributes:
-        part: Of the samples.
-        index: Of the samples.
-        other: Of the solid.
-        a: State of the samples' part.
-        b: State of the solid's.
-        sign: 1 if normals out of the solid point from the pair's first part to its second, else −1.
-    """
-
-    part: Part
-    index: PartIndex
-    other: PartIndex
-    a: BodyState
-    b: BodyState
-    sign: real
+    part: Part  # Of the samples
+    index: PartIndex  # Of the samples
+    other: PartIndex  # Of the solid
+    a: BodyState  # State of the samples' part
+    b: BodyState  # State of the solid's
+    sign: real  # 1 if normals out of the solid point from the pair's first part to its second, else −1
 
 
 @wp.func

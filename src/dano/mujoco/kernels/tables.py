@@ -39,79 +39,45 @@ class Part:
 
 @wp.struct
 class PartIndex:
-    """Whole numbers of a part.
+    """Whole numbers of a part."""
 
-    Attributes:
-        body: Body that it moves with.
-        geom: Geom that it is, or that stands for the object.
-        is_object: 1 for an object.
-        first_block: Of its samples.
-        blocks: How many it has; none where its samples are not asked.
-        first_run: Of runs of its blocks.
-        turning: How its samples turn.
-        solid: Kind of its solid, see `dano.mujoco.kernels.solids`; −1 for none.
-        at: Leaf of a solid of `dano.physics`, first plane of a hull, height field.
-        count: Planes of a hull.
-        contype: Of an object, as of MuJoCo's geoms.
-        conaffinity: The same.
-    """
-
-    body: wp.int32
-    geom: wp.int32
-    is_object: wp.int32
-    first_block: wp.int32
-    blocks: wp.int32
-    first_run: wp.int32
-    turning: wp.int32
-    solid: wp.int32
-    at: wp.int32
-    count: wp.int32
-    contype: wp.int32
-    conaffinity: wp.int32
+    body: wp.int32  # Body that it moves with
+    geom: wp.int32  # Geom that it is, or that stands for the object
+    is_object: wp.int32  # 1 for an object
+    first_block: wp.int32  # Of its samples
+    blocks: wp.int32  # How many it has; none where its samples are not asked
+    first_run: wp.int32  # Of runs of its blocks
+    turning: wp.int32  # How its samples turn
+    solid: wp.int32  # Kind of its solid, see `dano.mujoco.kernels.solids`; −1 for none
+    at: wp.int32  # Leaf of a solid of `dano.physics`, first plane of a hull, height field
+    count: wp.int32  # Planes of a hull
+    contype: wp.int32  # Of an object, as of MuJoCo's geoms
+    conaffinity: wp.int32  # The same
 
 
 @wp.struct
 class TouchPair:
-    """Two parts that may touch; the second is an object.
+    """Two parts that may touch; the second is an object."""
 
-    Attributes:
-        first: Part.
-        second: Part.
-        both: 1 where samples of the first are asked, too.
-    """
-
-    first: wp.int32
-    second: wp.int32
-    both: wp.int32
+    first: wp.int32  # Part
+    second: wp.int32  # Part
+    both: wp.int32  # 1 where samples of the first are asked, too
 
 
 @wp.struct
 class Known:
-    """What is known of a model.
+    """What is known of a model."""
 
-    Attributes:
-        parts: Shape (p,).
-        index: Shape (p,).
-        pairs: Shape (k,).
-        samples: Of all parts, in blocks.
-        precedence: Of each sample as a head of others, see `dano.mujoco.kernels.merging`.
-        balls: Centre and radius [m] of a ball around each block.
-        runs: The same around each run of blocks.
-        solids: Sampled distances and shapes.
-        planes: Unit outward normal and offset [m] of the faces of hulls.
-        sizes: Of the geoms when this was made [m], shape (geoms,).
-    """
-
-    parts: wp.array(dtype=Part)
-    index: wp.array(dtype=PartIndex)
-    pairs: wp.array(dtype=TouchPair)
-    samples: wp.array(dtype=Sample)
-    precedence: wp.array(dtype=real)
-    balls: wp.array(dtype=vec4)
-    runs: wp.array(dtype=vec4)
-    solids: Solids
-    planes: wp.array(dtype=vec4)
-    sizes: wp.array(dtype=vec3)
+    parts: wp.array(dtype=Part)  # Shape (p,)
+    index: wp.array(dtype=PartIndex)  # Shape (p,)
+    pairs: wp.array(dtype=TouchPair)  # Shape (k,)
+    samples: wp.array(dtype=Sample)  # Of all parts, in blocks
+    precedence: wp.array(dtype=real)  # Of each sample as a head of others, see `dano.mujoco.kernels.merging`
+    balls: wp.array(dtype=vec4)  # Centre and radius [m] of a ball around each block
+    runs: wp.array(dtype=vec4)  # The same around each run of blocks
+    solids: Solids  # Sampled distances and shapes
+    planes: wp.array(dtype=vec4)  # Unit outward normal and offset [m] of the faces of hulls
+    sizes: wp.array(dtype=vec3)  # Of the geoms when this was made [m], shape (geoms,)
 
 
 @wp.struct
@@ -174,25 +140,18 @@ class Settings:
 
 @wp.struct
 class Options:
-    """What a step is told besides.
+    """What a step is told besides."""
 
-    Attributes:
-        timestep: h [s].
-        most: Contacts of a pair.
-        given: 1 where `settings` has those of each pair, 0 where they are mixed of those of two geoms.
-        overridden: 1 where the model's global contact parameters replace those of geoms: those of the first
-            row of `settings`.
-        beyond: 1 where contacts are listed from margin and gap on and press from the margin on, as MuJoCo has
-            it since some version; 0 where they are listed from the margin on and press a gap later.
-        within: 1 where the solver takes no contact beyond its margin, see `mixing.held_back`.
-    """
-
-    timestep: real
-    most: real
-    given: real
+    timestep: real  # h [s]
+    most: real  # Contacts of a pair
+    given: real  # 1 where `settings` has those of each pair, 0 where they are mixed of those of two geoms
+    # 1 where the model's global contact parameters replace those of geoms: those of the first row of
+    # `settings`.
     overridden: real
+    # 1 where contacts are listed from margin and gap on and press from the margin on, as MuJoCo has it since
+    # some version; 0 where they are listed from the margin on and press a gap later.
     beyond: real
-    within: real
+    within: real  # 1 where the solver takes no contact beyond its margin, see `mixing.held_back`
 
 
 @wp.struct
@@ -257,24 +216,14 @@ class ContactIndex:
 
 @wp.struct
 class Work:
-    """What a search is told, works in, and finds.
+    """What a search is told, works in, and finds."""
 
-    Attributes:
-        options: Shape (1,).
-        settings: Shape (k,), see `Options`.
-        touches: Room for the samples of a pair that touch.
-        scores: Room for the highest of them, shape (most + 1,).
-        heads: Room for which of them are heads, shape (most,).
-        rows: The contacts.
-        index: The same.
-        found: Number of contacts, or −1 where sizes of geoms differ from those that are known; shape (1,).
-    """
-
-    options: wp.array(dtype=Options)
-    settings: wp.array(dtype=Settings)
-    touches: wp.array(dtype=Touch)
-    scores: wp.array(dtype=real)
-    heads: wp.array(dtype=wp.int32)
-    rows: wp.array(dtype=ContactRow)
-    index: wp.array(dtype=ContactIndex)
+    options: wp.array(dtype=Options)  # Shape (1,)
+    settings: wp.array(dtype=Settings)  # Shape (k,), see `Options`
+    touches: wp.array(dtype=Touch)  # Room for the samples of a pair that touch
+    scores: wp.array(dtype=real)  # Room for the highest of them, shape (most + 1,)
+    heads: wp.array(dtype=wp.int32)  # Room for which of them are heads, shape (most,)
+    rows: wp.array(dtype=ContactRow)  # The contacts
+    index: wp.array(dtype=ContactIndex)  # The same
+    # Number of contacts, or −1 where sizes of geoms differ from those that are known; shape (1,).
     found: wp.array(dtype=wp.int32)

@@ -136,19 +136,12 @@ def first_node(u: real, nodes: int, degree: int) -> int:
 
 @wp.struct
 class Stencil:
-    """The coefficients that a place has to do with.
+    """The coefficients that a place has to do with."""
 
-    Attributes:
-        base: The first of them.
-        stride_x: From one to the next along x.
-        stride_y: The same along y; along z they lie side by side.
-        shares: The place, in cells from the node from which weights count.
-    """
-
-    base: int
-    stride_x: int
-    stride_y: int
-    shares: vec3
+    base: int  # The first of them
+    stride_x: int  # From one to the next along x
+    stride_y: int  # The same along y; along z they lie side by side
+    shares: vec3  # The place, in cells from the node from which weights count
 
 
 @wp.func

@@ -10,65 +10,41 @@ from dano.physics.real import mat33, ONE, real, vec3, ZERO
 
 @wp.struct
 class Leaf:
-    """One part of a solid.
+    """One part of a solid."""
 
-    Attributes:
-        factor: Size s [1].
-        position: p [m, F].
-        rotation: R, leaf → F.
-        sizes: Unit normal of a half-space; half extents of a box; radius and half length of a capsule or
-            cylinder; radius of a sphere; semi-axes of an ellipsoid; first node of a grid [m].
-        length: Offset of a half-space's plane; rounding of a box [m].
-        spacing: Between nodes of a grid [m].
-    """
-
-    factor: real
-    position: vec3
-    rotation: mat33
+    factor: real  # Size s [1]
+    position: vec3  # p [m, F]
+    rotation: mat33  # R, leaf → F
+    # Unit normal of a half-space; half extents of a box; radius and half length of a capsule or cylinder;
+    # radius of a sphere; semi-axes of an ellipsoid; first node of a grid [m].
     sizes: vec3
-    length: real
-    spacing: vec3
+    length: real  # Offset of a half-space's plane; rounding of a box [m]
+    spacing: vec3  # Between nodes of a grid [m]
 
 
 @wp.struct
 class LeafKind:
-    """Whole numbers of a leaf.
+    """Whole numbers of a leaf."""
 
-    Attributes:
-        kind: Its number, see above.
-        first: Place of a grid's first spline coefficient.
-        nodes_x: Number of coefficients along x, border included.
-        nodes_y: Along y.
-        nodes_z: Along z.
-        degree: Of the spline.
-        first_bound: Place of the first lower bound on a grid's spline.
-    """
-
-    kind: wp.int32
-    first: wp.int32
-    nodes_x: wp.int32
-    nodes_y: wp.int32
-    nodes_z: wp.int32
-    degree: wp.int32
-    first_bound: wp.int32
+    kind: wp.int32  # Its number, see above
+    first: wp.int32  # Place of a grid's first spline coefficient
+    nodes_x: wp.int32  # Number of coefficients along x, border included
+    nodes_y: wp.int32  # Along y
+    nodes_z: wp.int32  # Along z
+    degree: wp.int32  # Of the spline
+    first_bound: wp.int32  # Place of the first lower bound on a grid's spline
 
 
 @wp.struct
 class Solids:
-    """All solids of a scene.
+    """All solids of a scene."""
 
-    Attributes:
-        leaves: Shape (worlds, leaves).
-        kinds: Shape (leaves,).
-        coefficients: Spline coefficients of all grids [m], shape (worlds, coefficients).
-        bounds: Lower bounds on the splines of all grids, one for each `CELL`³ cells [m], (worlds, bounds).
-        changes: Of the coefficients, one direction after the other; only for forward derivatives.
-    """
-
-    leaves: wp.array2d(dtype=Leaf)
-    kinds: wp.array(dtype=LeafKind)
-    coefficients: wp.array2d(dtype=real)
+    leaves: wp.array2d(dtype=Leaf)  # Shape (worlds, leaves)
+    kinds: wp.array(dtype=LeafKind)  # Shape (leaves,)
+    coefficients: wp.array2d(dtype=real)  # Spline coefficients of all grids [m], shape (worlds, coefficients)
+    # Lower bounds on the splines of all grids, one for each `CELL`³ cells [m], (worlds, bounds).
     bounds: wp.array2d(dtype=real)
+    # Of the coefficients, one direction after the other; only for forward derivatives.
     changes: wp.array2d(dtype=real)
 
 

@@ -16,19 +16,12 @@ from dano.physics.twists import angular_part, joined, linear_part
 
 @wp.struct
 class Composite:
-    """Change of the momentum of bodies, at the origin of their tree, with a motion at the end of a step.
+    """Change of the momentum of bodies, at the origin of their tree, with a motion at the end of a step."""
 
-    Attributes:
-        mass: [kg].
-        lever: Mass times the lever from the origin to the centre of mass at the start [kg m].
-        lever_after: … at the end.
-        block: Part of moments by turns [kg m²].
-    """
-
-    mass: real
-    lever: vec3
-    lever_after: vec3
-    block: mat33
+    mass: real  # [kg]
+    lever: vec3  # Mass times the lever from the origin to the centre of mass at the start [kg m]
+    lever_after: vec3  # … at the end
+    block: mat33  # Part of moments by turns [kg m²]
 
 
 @wp.func

@@ -22,54 +22,31 @@ _STICKS, _STOPS, _CLOSES = wp.constant(real(STICKS)), wp.constant(real(STOPS)), 
 
 @wp.struct
 class JointLaw:
-    """What acts on a coordinate q: see `dano.scene.JointLaws`. What no joint has is 0, or endless.
+    """What acts on a coordinate q: see `dano.scene.JointLaws`. What no joint has is 0, or endless."""
 
-    Attributes:
-        damping: [N m s/rad or N s/m].
-        armature: [kg m² or kg].
-        stiffness: Of a spring [N m/rad or N/m].
-        rest: Where it is slack [rad or m].
-        friction: [N m or N].
-        least: Smallest q [rad or m].
-        most: Largest q.
-        gear: Of a motor, 0 where there is none.
-        motor_stiffness: [N m/rad or N/m].
-        motor_damping: [N m s/rad or N s/m].
-        least_effort: Smallest effort of the motor [N m or N].
-        most_effort: Largest one.
-    """
-
-    damping: real
-    armature: real
-    stiffness: real
-    rest: real
-    friction: real
-    least: real
-    most: real
-    gear: real
-    motor_stiffness: real
-    motor_damping: real
-    least_effort: real
-    most_effort: real
+    damping: real  # [N m s/rad or N s/m]
+    armature: real  # [kg m² or kg]
+    stiffness: real  # Of a spring [N m/rad or N/m]
+    rest: real  # Where it is slack [rad or m]
+    friction: real  # [N m or N]
+    least: real  # Smallest q [rad or m]
+    most: real  # Largest q
+    gear: real  # Of a motor, 0 where there is none
+    motor_stiffness: real  # [N m/rad or N/m]
+    motor_damping: real  # [N m s/rad or N s/m]
+    least_effort: real  # Smallest effort of the motor [N m or N]
+    most_effort: real  # Largest one
 
 
 @wp.struct
 class JointDrive:
-    """What drives a coordinate in a step.
+    """What drives a coordinate in a step."""
 
-    Attributes:
-        q: At the start [rad or m].
-        v: Velocity of the step before [rad/s or m/s].
-        effort: [N m or N].
-        command: Of its motor.
-        constant: Whether the motor gives what it is told to, whatever the joint does.
-    """
-
-    q: real
-    v: real
-    effort: real
-    command: real
-    constant: bool
+    q: real  # At the start [rad or m]
+    v: real  # Velocity of the step before [rad/s or m/s]
+    effort: real  # [N m or N]
+    command: real  # Of its motor
+    constant: bool  # Whether the motor gives what it is told to, whatever the joint does
 
 
 @wp.struct

@@ -50,20 +50,13 @@ class Joint:
 
 @wp.struct
 class JointFrame:
-    """Where a joint is at the start of a step [W].
+    """Where a joint is at the start of a step [W]."""
 
-    Attributes:
-        pivot: A point on its axis [m].
-        first: Directions: those of a ball are the axes of its child; the first two of a planar joint span its
-            plane.
-        second: …
-        axis: The axis, or the third of them.
-    """
-
-    pivot: vec3
+    pivot: vec3  # A point on its axis [m]
+    # Directions: those of a ball are the axes of its child; the first two of a planar joint span its plane.
     first: vec3
-    second: vec3
-    axis: vec3
+    second: vec3  # …
+    axis: vec3  # The axis, or the third of them
 
 
 @wp.struct

@@ -31,17 +31,11 @@ class Shown(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """Numbers over a run.
+    """Numbers over a run."""
 
-    Attributes:
-        times: [s].
-        energy: Kinetic and potential energy of what moves freely [J].
-        force: Sum of the contact forces' lengths [N]; None without contacts.
-    """
-
-    times: Float[np.ndarray, " T"]
-    energy: Float[np.ndarray, " T"]
-    force: Float[np.ndarray, " T"] | None
+    times: Float[np.ndarray, " T"]  # [s]
+    energy: Float[np.ndarray, " T"]  # Kinetic and potential energy of what moves freely [J]
+    force: Float[np.ndarray, " T"] | None  # Sum of the contact forces' lengths [N]; None without contacts
 
 
 class Drawn:

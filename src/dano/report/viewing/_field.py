@@ -103,15 +103,10 @@ def _check(field: AbstractField, level: float | None) -> None:
 
 
 class Surface:
-    """The surface of a field at any level (host).
+    """The surface of a field at any level (host)."""
 
-    Attributes:
-        level: Density of the surface when the page opens; None for a solid.
-        levels: Lowest and highest density of the surface; None for a solid.
-    """
-
-    level: float | None
-    levels: tuple[float, float] | None
+    level: float | None  # Density of the surface when the page opens; None for a solid
+    levels: tuple[float, float] | None  # Lowest and highest density of the surface; None for a solid
 
     def __init__(self, field: AbstractField, level: float | None):
         """Sample a field.

@@ -18,17 +18,11 @@ _CELLS = 8
 
 
 class Ground(NamedTuple):
-    """A grid that was drawn.
+    """A grid that was drawn."""
 
-    Attributes:
-        said: What it is, in words.
-        points: Its corners and the ends of the axes [m].
-        front: A place before its front edge [m].
-    """
-
-    said: str
-    points: Float[np.ndarray, "n 3"]
-    front: Float[np.ndarray, "3"]
+    said: str  # What it is, in words
+    points: Float[np.ndarray, "n 3"]  # Its corners and the ends of the axes [m]
+    front: Float[np.ndarray, "3"]  # A place before its front edge [m]
 
 
 def add_ground(

@@ -24,17 +24,11 @@ _CONVEX = tuple(shape for shape in PRIMITIVES.values() if shape is not HalfSpace
 
 
 class BodyMesh(NamedTuple):
-    """Triangles of a body.
+    """Triangles of a body."""
 
-    Attributes:
-        vertices: [m, F].
-        faces: Indices of vertices.
-        colours: Of the vertices, 0 to 255; None if the body has learned none.
-    """
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    colours: UInt8[np.ndarray, "v 3"] | None
+    vertices: Float[np.ndarray, "v 3"]  # [m, F]
+    faces: Int[np.ndarray, "f 3"]  # Indices of vertices
+    colours: UInt8[np.ndarray, "v 3"] | None  # Of the vertices, 0 to 255; None if the body has learned none
 
 
 def body_mesh(body: Body, look: LearnedField | None) -> BodyMesh | None:

@@ -27,15 +27,10 @@ _CHOICE = """<script>
 
 
 class Place(NamedTuple):
-    """A camera.
+    """A camera."""
 
-    Attributes:
-        position: Where it stands [m, W].
-        look_at: What it looks at [m, W].
-    """
-
-    position: Float[np.ndarray, "3"]
-    look_at: Float[np.ndarray, "3"]
+    position: Float[np.ndarray, "3"]  # Where it stands [m, W]
+    look_at: Float[np.ndarray, "3"]  # What it looks at [m, W]
 
     @property
     def distance(self) -> float:
@@ -44,15 +39,10 @@ class Place(NamedTuple):
 
 
 class Opening(NamedTuple):
-    """Where a page opens.
+    """Where a page opens."""
 
-    Attributes:
-        wide: In windows that are wider than high.
-        upright: In others.
-    """
-
-    wide: Place
-    upright: Place
+    wide: Place  # In windows that are wider than high
+    upright: Place  # In others
 
     def in_page(self, page: str) -> str:
         """A page in one file, which chooses when it is opened."""

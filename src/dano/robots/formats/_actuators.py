@@ -12,15 +12,10 @@ ALL, OTHER = "actuators", "other actuators"
 
 
 class Pull(NamedTuple):
-    """A drive of several joints: its length is the sum of their coordinates by their shares.
+    """A drive of several joints: its length is the sum of their coordinates by their shares."""
 
-    Attributes:
-        drive: The drive.
-        shares: By the indices of the joints.
-    """
-
-    drive: Drive
-    shares: dict[int, float]
+    drive: Drive  # The drive
+    shares: dict[int, float]  # By the indices of the joints
 
 
 def drives_of(model: Any, mujoco: Any) -> tuple[dict[int, Drive], list[Pull], list[Lacking]]:

@@ -22,15 +22,10 @@ _STRAIGHT = 1e-12
 
 
 class Length(NamedTuple):
-    """A length Σ ratioⱼ qⱼ + shift, of joints that follow none [m or rad].
+    """A length Σ ratioⱼ qⱼ + shift, of joints that follow none [m or rad]."""
 
-    Attributes:
-        ratios: By the names of the joints; those that cancel out are left out.
-        shift: What joints that stay where they are add, and shifts of those that follow.
-    """
-
-    ratios: dict[str, float]
-    shift: float
+    ratios: dict[str, float]  # By the names of the joints; those that cancel out are left out
+    shift: float  # What joints that stay where they are add, and shifts of those that follow
 
 
 def length_of(shares: Mapping[str, float], joints: list[Connection], held: Mapping[str, float]) -> Length:

@@ -86,17 +86,11 @@ def read_picture(file: Path, upright: Callable[["Turned"], bool] = lambda turned
 
 
 class Turned(NamedTuple):
-    """A picture that was not held upright.
+    """A picture that was not held upright."""
 
-    Attributes:
-        file: Its file.
-        size: Width and height of the stored pixels.
-        orientation: EXIF's, from 2 to 8.
-    """
-
-    file: Path
-    size: tuple[int, int]
-    orientation: int
+    file: Path  # Its file
+    size: tuple[int, int]  # Width and height of the stored pixels
+    orientation: int  # EXIF's, from 2 to 8
 
 
 def read_mask(

@@ -37,25 +37,16 @@ GAUSSIAN = 1.4826
 
 
 class Tabletop(NamedTuple):
-    """What a table looks like from above.
+    """What a table looks like from above."""
 
-    Attributes:
-        height: z of the table [m, W].
-        corner: Of the first cell's middle [m, W].
-        spacing: Of the cells [m].
-        least: Of each of `features` around each cell, (n, n, 5).
-        most: The largest.
-        varies: By how much photographs differ there usually, in each channel; infinite where too few show it.
-        gain: Brightness of each photograph over that of all, shape (views, 3).
-    """
-
-    height: float
-    corner: Float[np.ndarray, "2"]
-    spacing: float
-    least: Float[np.ndarray, "n n 5"]
-    most: Float[np.ndarray, "n n 5"]
+    height: float  # z of the table [m, W]
+    corner: Float[np.ndarray, "2"]  # Of the first cell's middle [m, W]
+    spacing: float  # Of the cells [m]
+    least: Float[np.ndarray, "n n 5"]  # Of each of `features` around each cell, (n, n, 5)
+    most: Float[np.ndarray, "n n 5"]  # The largest
+    # By how much photographs differ there usually, in each channel; infinite where too few show it.
     varies: Float[np.ndarray, "n n 3"]
-    gain: Float[np.ndarray, "views 3"]
+    gain: Float[np.ndarray, "views 3"]  # Brightness of each photograph over that of all, shape (views, 3)
 
     @staticmethod
     def of(
@@ -115,18 +106,15 @@ def _gain(seen: np.ndarray, level: np.ndarray) -> Float[np.ndarray, "views 3"]:
 
 
 class Behind(NamedTuple):
-    """What each pixel of a photograph would show of the table, in the brightness of all.
+    """What each pixel of a photograph would show of the table, in the brightness of all."""
 
-    Attributes:
-        picture: The photograph in the brightness of all, (height, width, 3).
-        off: By how much each of `features` is beside what the table shows around, (height, width, 5).
-        wide: How far the table's own colours lie apart there, (height, width, 3).
-        varies: By how much photographs differ there usually; infinite where the table is not known.
-    """
-
+    # The photograph in the brightness of all, (height, width, 3).
     picture: Float[np.ndarray, "height width 3"]
+    # By how much each of `features` is beside what the table shows around, (height, width, 5).
     off: Float[np.ndarray, "height width 5"]
+    # How far the table's own colours lie apart there, (height, width, 3).
     wide: Float[np.ndarray, "height width 3"]
+    # By how much photographs differ there usually; infinite where the table is not known.
     varies: Float[np.ndarray, "height width 3"]
 
     @property

@@ -97,29 +97,18 @@ class Part(eqx.Module):
 
 
 class Plane(NamedTuple):
-    """An opaque matte half-space.
+    """An opaque matte half-space."""
 
-    Attributes:
-        normal: Unit [W], shape (3,).
-        offset: Height above the origin along it [m].
-        albedo: Linear, shape (3,).
-    """
-
-    normal: Float[Array, "3"]
-    offset: Float[Array, ""]
-    albedo: Float[Array, "3"]
+    normal: Float[Array, "3"]  # Unit [W], shape (3,)
+    offset: Float[Array, ""]  # Height above the origin along it [m]
+    albedo: Float[Array, "3"]  # Linear, shape (3,)
 
 
 class PaintedSolid(AbstractSurface):
-    """A shape of one matte colour.
+    """A shape of one matte colour."""
 
-    Attributes:
-        shape: Signed distance.
-        albedo: Linear, shape (3,).
-    """
-
-    shape: AbstractShape
-    albedo: Float[Array, "3"]
+    shape: AbstractShape  # Signed distance
+    albedo: Float[Array, "3"]  # Linear, shape (3,)
 
     @property
     def bounds(self) -> Float[Array, "2 3"]:
@@ -147,17 +136,11 @@ class PaintedSolid(AbstractSurface):
 
 
 class PaintedMedium(AbstractMedium):
-    """A medium of one colour that scatters alike in all directions, once.
+    """A medium of one colour that scatters alike in all directions, once."""
 
-    Attributes:
-        grid: Density.
-        scale: Extinction [1/m] per unit of it.
-        albedo: Linear, shape (3,).
-    """
-
-    grid: GridField
-    scale: Float[Array, ""]
-    albedo: Float[Array, "3"]
+    grid: GridField  # Density
+    scale: Float[Array, ""]  # Extinction [1/m] per unit of it
+    albedo: Float[Array, "3"]  # Linear, shape (3,)
 
     @property
     def bounds(self) -> Float[Array, "2 3"]:

@@ -43,41 +43,24 @@ _FEW, _SHARES = 512, 4
 
 
 class Thing(NamedTuple):
-    """A solid somewhere (host only).
+    """A solid somewhere (host only)."""
 
-    Attributes:
-        shape: Its signed distance, bounded.
-        rotation: F → W (3, 3).
-        position: Of the field frame [m, W] (3,).
-        centre: Of a ball around it [m, W] (3,).
-        radius: Of that ball [m].
-        own_shadows: Whether it already shows the light that it takes from itself.
-    """
-
-    shape: AbstractShape
-    rotation: Float[np.ndarray, "3 3"]
-    position: Float[np.ndarray, "3"]
-    centre: Float[np.ndarray, "3"]
-    radius: float
-    own_shadows: bool
+    shape: AbstractShape  # Its signed distance, bounded
+    rotation: Float[np.ndarray, "3 3"]  # F → W (3, 3)
+    position: Float[np.ndarray, "3"]  # Of the field frame [m, W] (3,)
+    centre: Float[np.ndarray, "3"]  # Of a ball around it [m, W] (3,)
+    radius: float  # Of that ball [m]
+    own_shadows: bool  # Whether it already shows the light that it takes from itself
 
 
 class Met(NamedTuple):
-    """What rays meet.
+    """What rays meet."""
 
-    Attributes:
-        depth: Distance [m] (n,), infinite where nothing is met.
-        which: Number of the plane, or of the thing after all planes; −1 for none; (n,).
-        normals: Unit normals [W] (3, n).
-        lamp: Shares of the lamp's light that arrive (n,).
-        ambient: Shares of the light from all around (n,).
-    """
-
-    depth: Float[np.ndarray, " n"]
-    which: Int[np.ndarray, " n"]
-    normals: Float[np.ndarray, "3 n"]
-    lamp: Float[np.ndarray, " n"]
-    ambient: Float[np.ndarray, " n"]
+    depth: Float[np.ndarray, " n"]  # Distance [m] (n,), infinite where nothing is met
+    which: Int[np.ndarray, " n"]  # Number of the plane, or of the thing after all planes; −1 for none; (n,)
+    normals: Float[np.ndarray, "3 n"]  # Unit normals [W] (3, n)
+    lamp: Float[np.ndarray, " n"]  # Shares of the lamp's light that arrive (n,)
+    ambient: Float[np.ndarray, " n"]  # Shares of the light from all around (n,)
 
 
 class Tracer:
@@ -243,15 +226,10 @@ def _each(works: Sequence[Launch]) -> None:
 
 
 class _Tables(NamedTuple):
-    """Leaves of some shapes.
+    """Leaves of some shapes."""
 
-    Attributes:
-        parts: First leaf, number of leaves and bounds [m, F] of each shape.
-        arrays: Of `dano.physics.solids.leaves.Solids`, by name.
-    """
-
-    parts: list[tuple[int, int, np.ndarray]]
-    arrays: dict[str, np.ndarray]
+    parts: list[tuple[int, int, np.ndarray]]  # First leaf, number of leaves and bounds [m, F] of each shape
+    arrays: dict[str, np.ndarray]  # Of `dano.physics.solids.leaves.Solids`, by name
 
 
 _known: dict[tuple[int, ...], tuple[list[Any], _Tables]] = {}

@@ -159,19 +159,12 @@ def render(
 
 
 class _Rays(NamedTuple):
-    """A ray for each pixel of a picture.
+    """A ray for each pixel of a picture."""
 
-    Attributes:
-        order: Its pixel (n,).
-        rank: The ray of each pixel (n,).
-        regular: See `pixel_order`.
-        directions: Unit vectors [W] (3, n).
-    """
-
-    order: Int[np.ndarray, " n"]
-    rank: Int[np.ndarray, " n"]
-    regular: int
-    directions: Float[np.ndarray, "3 n"]
+    order: Int[np.ndarray, " n"]  # Its pixel (n,)
+    rank: Int[np.ndarray, " n"]  # The ray of each pixel (n,)
+    regular: int  # See `pixel_order`
+    directions: Float[np.ndarray, "3 n"]  # Unit vectors [W] (3, n)
 
 
 _kept: dict[bytes, _Rays] = {}

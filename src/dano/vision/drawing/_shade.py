@@ -19,25 +19,15 @@ _FLOOR = np.array([0.80, 0.805, 0.81], dtype=np.float32)
 
 
 class Surroundings(NamedTuple):
-    """Light and surroundings of a picture.
+    """Light and surroundings of a picture."""
 
-    Attributes:
-        light: Unit direction towards the lamp [W].
-        horizon: Linear colour where floor and sky meet.
-        focus: The point looked at [m, W].
-        fade_start: Distance from it [m] at which the floor starts to fade into the horizon.
-        fade_end: Distance from it [m] at which it has faded.
-        tile: Side of the floor's tiles [m].
-        pixel: Angle of a pixel [rad].
-    """
-
-    light: Float[np.ndarray, "3"]
-    horizon: Float[np.ndarray, "3"]
-    focus: Float[np.ndarray, "3"]
-    fade_start: float
-    fade_end: float
-    tile: float
-    pixel: float
+    light: Float[np.ndarray, "3"]  # Unit direction towards the lamp [W]
+    horizon: Float[np.ndarray, "3"]  # Linear colour where floor and sky meet
+    focus: Float[np.ndarray, "3"]  # The point looked at [m, W]
+    fade_start: float  # Distance from it [m] at which the floor starts to fade into the horizon
+    fade_end: float  # Distance from it [m] at which it has faded
+    tile: float  # Side of the floor's tiles [m]
+    pixel: float  # Angle of a pixel [rad]
 
     @property
     def colours(self) -> dict[str, Float[np.ndarray, "3"]]:

@@ -42,26 +42,18 @@ _CHUNK, _PAIRS_CHUNK = 8, 200
 
 
 class Matches(NamedTuple):
-    """What pictures have in common.
+    """What pictures have in common."""
 
-    Attributes:
-        database: File of COLMAP.
-        points: Number of points by picture.
-        coordinates: Coordinates x, y of points by picture [pixels of the upright picture].
-        pairs: Indices of compared pictures, shape (pairs, 2).
-        raw: Number of similar points by pair.
-        moved: Median distance by pair between the places of similar points in its pictures [pixels]; NaN
-            where there are too few.
-        verified: Indices of points in both pictures that one motion explains, by pair, each of shape
-            (matches, 2).
-    """
-
-    database: Path
-    points: Int[np.ndarray, " pictures"]
+    database: Path  # File of COLMAP
+    points: Int[np.ndarray, " pictures"]  # Number of points by picture
+    # Coordinates x, y of points by picture [pixels of the upright picture].
     coordinates: tuple[np.ndarray, ...]
-    pairs: Int[np.ndarray, "pairs 2"]
-    raw: Int[np.ndarray, " pairs"]
+    pairs: Int[np.ndarray, "pairs 2"]  # Indices of compared pictures, shape (pairs, 2)
+    raw: Int[np.ndarray, " pairs"]  # Number of similar points by pair
+    # Median distance by pair between the places of similar points in its pictures [pixels]; NaN where there
+    # are too few.
     moved: Float[np.ndarray, " pairs"]
+    # Indices of points in both pictures that one motion explains, by pair, each of shape (matches, 2).
     verified: tuple[np.ndarray, ...]
 
 

@@ -37,33 +37,23 @@ class Lens(NamedTuple):
 
 
 class Model(NamedTuple):
-    """Pictures whose cameras are known in one frame, whose scale and orientation mean nothing.
+    """Pictures whose cameras are known in one frame, whose scale and orientation mean nothing."""
 
-    Attributes:
-        pictures: Their indices.
-        cameras: World to camera, x right, y down, z forward, by picture, shape (pictures, 3, 4).
-        lenses: By picture.
-        points: Points in space, shape (points, 3).
-        seen: For each observation the row of `cameras` and of `points`, shape (observations, 2).
-        coordinates: And where [pixels], shape (observations, 2).
-        residuals: Distance between it and the projected point [pixels], shape (observations,).
-        focal_error: Standard deviation of each picture's focal length, as a share of it; 0 where it was
-            given.
-        freed_focal: Where focal lengths were given: by what factor they would change if they were estimated;
-            1 otherwise.
-        freed_gain: And by what factor the residuals would fall.
-    """
-
-    pictures: tuple[int, ...]
+    pictures: tuple[int, ...]  # Their indices
+    # World to camera, x right, y down, z forward, by picture, shape (pictures, 3, 4).
     cameras: Float[np.ndarray, "pictures 3 4"]
-    lenses: tuple[Lens, ...]
-    points: Float[np.ndarray, "points 3"]
+    lenses: tuple[Lens, ...]  # By picture
+    points: Float[np.ndarray, "points 3"]  # Points in space, shape (points, 3)
+    # For each observation the row of `cameras` and of `points`, shape (observations, 2).
     seen: Int[np.ndarray, "observations 2"]
-    coordinates: Float[np.ndarray, "observations 2"]
+    coordinates: Float[np.ndarray, "observations 2"]  # And where [pixels], shape (observations, 2)
+    # Distance between it and the projected point [pixels], shape (observations,).
     residuals: Float[np.ndarray, " observations"]
+    # Standard deviation of each picture's focal length, as a share of it; 0 where it was given.
     focal_error: Float[np.ndarray, " pictures"]
+    # Where focal lengths were given: by what factor they would change if they were estimated; 1 otherwise.
     freed_focal: float = 1.0
-    freed_gain: float = 1.0
+    freed_gain: float = 1.0  # And by what factor the residuals would fall
 
     @property
     def centres(self) -> Float[np.ndarray, "pictures 3"]:

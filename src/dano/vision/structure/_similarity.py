@@ -10,17 +10,11 @@ from dano.vision.capture import PosedCamera
 
 
 class Similarity(NamedTuple):
-    """x ↦ scale · rotation x + shift.
+    """x ↦ scale · rotation x + shift."""
 
-    Attributes:
-        scale: By what factor lengths grow.
-        rotation: Shape (3, 3).
-        shift: Shape (3,).
-    """
-
-    scale: float
-    rotation: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, "3"]
+    scale: float  # By what factor lengths grow
+    rotation: Float[np.ndarray, "3 3"]  # Shape (3, 3)
+    shift: Float[np.ndarray, "3"]  # Shape (3,)
 
     def points(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Where points go."""

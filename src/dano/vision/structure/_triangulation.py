@@ -13,16 +13,11 @@ _TOLERANCE = 1.0
 
 
 class Triangulated(NamedTuple):
-    """A point and how well it is known.
+    """A point and how well it is known."""
 
-    Attributes:
-        point: Where it is.
-        covariance: For errors of one pixel, shape (3, 3).
-        residuals: Distance between observation and projection [pixels], by camera.
-    """
-
-    point: Float[np.ndarray, "3"]
-    covariance: Float[np.ndarray, "3 3"]
+    point: Float[np.ndarray, "3"]  # Where it is
+    covariance: Float[np.ndarray, "3 3"]  # For errors of one pixel, shape (3, 3)
+    # Distance between observation and projection [pixels], by camera.
     residuals: Float[np.ndarray, " cameras"]
 
 

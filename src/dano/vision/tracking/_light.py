@@ -259,21 +259,13 @@ def on_table(
 
 
 class _Shadow(NamedTuple):
-    """What a frame shows of the table around the object.
+    """What a frame shows of the table around the object."""
 
-    Attributes:
-        place: Where the object is.
-        points: Points of the table [m, W], shape (n, 3).
-        shade: Their linear brightness over that without the object (n,).
-        sky: Share of the sky's light that the object keeps from them (n,).
-        noise: Standard deviation of `shade`.
-    """
-
-    place: Placement
-    points: np.ndarray
-    shade: np.ndarray
-    sky: np.ndarray
-    noise: float
+    place: Placement  # Where the object is
+    points: np.ndarray  # Points of the table [m, W], shape (n, 3)
+    shade: np.ndarray  # Their linear brightness over that without the object (n,)
+    sky: np.ndarray  # Share of the sky's light that the object keeps from them (n,)
+    noise: float  # Standard deviation of `shade`
 
 
 class ShadowFit:

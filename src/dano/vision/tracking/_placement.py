@@ -16,19 +16,12 @@ _MOST_MOMENTS = 6
 
 
 class Drift(NamedTuple):
-    """Motion of an object while a frame is exposed.
+    """Motion of an object while a frame is exposed."""
 
-    Attributes:
-        velocity: Of the middle of the object [m/s, W], shape (3,).
-        spin: Angular velocity [rad/s, W], shape (3,).
-        shutter: How long each row of the picture is exposed [s].
-        readout: How much later the last row is exposed than the first [s].
-    """
-
-    velocity: Float[np.ndarray, "3"]
-    spin: Float[np.ndarray, "3"]
-    shutter: float
-    readout: float
+    velocity: Float[np.ndarray, "3"]  # Of the middle of the object [m/s, W], shape (3,)
+    spin: Float[np.ndarray, "3"]  # Angular velocity [rad/s, W], shape (3,)
+    shutter: float  # How long each row of the picture is exposed [s]
+    readout: float  # How much later the last row is exposed than the first [s]
 
     @classmethod
     def between(cls, before: "Placement", after: "Placement", duration: float, middle, shutter, readout):
@@ -63,17 +56,11 @@ class Drift(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Placement:
-    """Where the object's field frame is.
+    """Where the object's field frame is."""
 
-    Attributes:
-        position: Of its origin [m, W], shape (3,).
-        orientation: Unit quaternion wxyz, F → W, shape (4,).
-        drift: How it moves while the frame is exposed; None if it is taken to stand still.
-    """
-
-    position: Float[np.ndarray, "3"]
-    orientation: Float[np.ndarray, "4"]
-    drift: Drift | None = None
+    position: Float[np.ndarray, "3"]  # Of its origin [m, W], shape (3,)
+    orientation: Float[np.ndarray, "4"]  # Unit quaternion wxyz, F → W, shape (4,)
+    drift: Drift | None = None  # How it moves while the frame is exposed; None if it is taken to stand still
 
     def moved(self, change: Float[np.ndarray, "6"], radius: float) -> "Placement":
         """Shifted by `change[:3]` radii [W], then turned by the rotation vector `change[3:]` [rad, F]."""

@@ -67,27 +67,17 @@ _SMALL = 0.02
 
 
 class Refined(NamedTuple):
-    """A pose, and how it fits.
+    """A pose, and how it fits."""
 
-    Attributes:
-        place: The pose.
-        cost: Mean robust cost of a pixel.
-        overlap: Of mask and silhouette.
-        colour_error: Usual difference of colours, in sRGB; NaN without colours.
-        hessian: Gauss–Newton's, of the six numbers of `Placement.moved`, in 1/variances.
-        covariance: Of these numbers.
-        window: Part of the picture that was looked at.
-        silhouette: Rendered there.
-    """
-
-    place: Placement
-    cost: float
-    overlap: float
-    colour_error: float
+    place: Placement  # The pose
+    cost: float  # Mean robust cost of a pixel
+    overlap: float  # Of mask and silhouette
+    colour_error: float  # Usual difference of colours, in sRGB; NaN without colours
+    # Gauss–Newton's, of the six numbers of `Placement.moved`, in 1/variances.
     hessian: Float[np.ndarray, "6 6"]
-    covariance: Float[np.ndarray, "6 6"]
-    window: tuple[slice, slice]
-    silhouette: Float[np.ndarray, "_ _"]
+    covariance: Float[np.ndarray, "6 6"]  # Of these numbers
+    window: tuple[slice, slice]  # Part of the picture that was looked at
+    silhouette: Float[np.ndarray, "_ _"]  # Rendered there
 
 
 class _Rows(NamedTuple):

@@ -100,15 +100,10 @@ class Start(NamedTuple):
 
 
 class Pattern(NamedTuple):
-    """How a pattern agrees.
+    """How a pattern agrees."""
 
-    Attributes:
-        correlation: Of what is fine in the picture and as rendered, 0 to 1; 0 where too little is seen.
-        evidence: By how much the logarithm of the likelihood grows because of it, ≥ 0.
-    """
-
-    correlation: float
-    evidence: float
+    correlation: float  # Of what is fine in the picture and as rendered, 0 to 1; 0 where too little is seen
+    evidence: float  # By how much the logarithm of the likelihood grows because of it, ≥ 0
 
 
 class _Guess(NamedTuple):

@@ -265,14 +265,10 @@ def _log_frequency(
 
 
 class Segments(NamedTuple):
-    """What the pixels of a picture show.
+    """What the pixels of a picture show."""
 
-    Attributes:
-        mask: Where the object is, 0 to 1.
-        other: Where something else is, neither the object nor the place: a hand, or what pushes it.
-    """
-
-    mask: Float[np.ndarray, "height width"]
+    mask: Float[np.ndarray, "height width"]  # Where the object is, 0 to 1
+    # Where something else is, neither the object nor the place: a hand, or what pushes it.
     other: Bool[np.ndarray, "height width"]
 
 

@@ -60,17 +60,11 @@ _FAR = 3.0
 
 
 class Turned(NamedTuple):
-    """What patterns say of all poses.
+    """What patterns say of all poses."""
 
-    Attributes:
-        places: Poses after a half turn; None: they stay.
-        light: As these poses imply it: a light that was fitted to wrong ones is wrong.
-        clear: As in `told_apart`.
-    """
-
-    places: dict[int, Placement] | None
-    light: LightFit
-    clear: float
+    places: dict[int, Placement] | None  # Poses after a half turn; None: they stay
+    light: LightFit  # As these poses imply it: a light that was fitted to wrong ones is wrong
+    clear: float  # As in `told_apart`
 
 
 class Whole:

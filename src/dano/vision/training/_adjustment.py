@@ -17,21 +17,15 @@ from dano.vision.capture import Rays, View
 
 
 class Adjustment(eqx.Module):
-    """Corrections of the cameras of some views, to first order.
+    """Corrections of the cameras of some views, to first order."""
 
-    Attributes:
-        correction: Turns about, then shifts along each camera's axes (right, up, forward), in units in which
-            one turn or shift across the line of sight moves the picture of the object by a pixel.
-        axes: The cameras' axes [W], one a row, shape (views, 3, 3).
-        angle: Angles of a pixel [rad], shape (views,).
-        length: What these are at the object [m], shape (views,).
-        free: Orthonormal columns: corrections that are a motion or an enlargement of everything.
-    """
-
+    # Turns about, then shifts along each camera's axes (right, up, forward), in units in which one turn or
+    # shift across the line of sight moves the picture of the object by a pixel.
     correction: Float[Array, "views 6"]
-    axes: Float[Array, "views 3 3"]
-    angle: Float[Array, " views"]
-    length: Float[Array, " views"]
+    axes: Float[Array, "views 3 3"]  # The cameras' axes [W], one a row, shape (views, 3, 3)
+    angle: Float[Array, " views"]  # Angles of a pixel [rad], shape (views,)
+    length: Float[Array, " views"]  # What these are at the object [m], shape (views,)
+    # Orthonormal columns: corrections that are a motion or an enlargement of everything.
     free: Float[Array, "corrections 7"]
 
     @classmethod

@@ -62,15 +62,11 @@ walls, which come out half as opaque; the second follows a surface that came out
 
 
 class Cavities(NamedTuple):
-    """One reading of a fog.
+    """One reading of a fog."""
 
-    Attributes:
-        distance: Signed distance [m] of the hull without its cavities, on the nodes of the hull's box.
-        share: Volume of the cavities as a share of the hull's.
-    """
-
+    # Signed distance [m] of the hull without its cavities, on the nodes of the hull's box.
     distance: Float[np.ndarray, "nx ny nz"]
-    share: float
+    share: float  # Volume of the cavities as a share of the hull's
 
 
 def find_cavities(

@@ -56,15 +56,10 @@ _DEFAULT = TrainOptions()
 
 
 class Learned(eqx.Module):
-    """What is learned: an object, and where it was photographed from.
+    """What is learned: an object, and where it was photographed from."""
 
-    Attributes:
-        model: The object.
-        cameras: Corrections of the cameras.
-    """
-
-    model: SurfaceModel
-    cameras: Adjustment
+    model: SurfaceModel  # The object
+    cameras: Adjustment  # Corrections of the cameras
 
     @property
     def parts(self) -> Any:

@@ -30,14 +30,10 @@ _DEEP = 0.3
 
 
 class Flight(NamedTuple):
-    """Frames in a row in which a thing falls freely.
+    """Frames in a row in which a thing falls freely."""
 
-    Attributes:
-        threes: Neighbouring frames, shape (m, 3).
-        rates: Weights of their positions that make an acceleration [1/s²], shape (m, 3).
-    """
-
-    threes: Int[np.ndarray, "m 3"]
+    threes: Int[np.ndarray, "m 3"]  # Neighbouring frames, shape (m, 3)
+    # Weights of their positions that make an acceleration [1/s²], shape (m, 3).
     rates: Float[np.ndarray, "m 3"]
 
 

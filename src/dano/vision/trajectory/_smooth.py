@@ -192,16 +192,12 @@ class _Run(NamedTuple):
 
 
 class _Minimum(NamedTuple):
-    """Where steps ended.
+    """Where steps ended."""
 
-    Attributes:
-        poses: Of the frames.
-        shared: Height and tilts of the face of each run; where the centre of mass lies beside the expected
-            one [sizes, F], if there is a flight; how many standard deviations all frames are off alike, six
-            numbers; then the share by which they see too far.
-    """
-
-    poses: Poses
+    poses: Poses  # Of the frames
+    # Height and tilts of the face of each run; where the centre of mass lies beside the expected one [sizes,
+    # F], if there is a flight; how many standard deviations all frames are off alike, six numbers; then the
+    # share by which they see too far.
     shared: Float[np.ndarray, " m"]
     weight: Float[np.ndarray, " n"]
     cost: float

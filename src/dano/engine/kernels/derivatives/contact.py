@@ -52,29 +52,17 @@ _BALL = wp.constant(BALL)
 
 @wp.struct
 class PairBar:
-    """Derivatives by what a pair of bodies is at the start of a step, from its points.
+    """Derivatives by what a pair of bodies is at the start of a step, from its points."""
 
-    Attributes:
-        first: By the state of the sampled body.
-        second: By that of the other.
-        scale: By the semi-axes of the sampled body.
-        timestep: By h.
-        sink: By the depth up to which predicted geometry is taken.
-        impact_depth: By δ.
-        factor: By F.
-        deepest: By the depth that another part may have.
-        twists: By twists and virtual twists, of bodies on joints.
-    """
-
-    first: BodyState
-    second: BodyState
-    scale: vec3
-    timestep: real
-    sink: real
-    impact_depth: real
-    factor: real
-    deepest: real
-    twists: Virtual
+    first: BodyState  # By the state of the sampled body
+    second: BodyState  # By that of the other
+    scale: vec3  # By the semi-axes of the sampled body
+    timestep: real  # By h
+    sink: real  # By the depth up to which predicted geometry is taken
+    impact_depth: real  # By δ
+    factor: real  # By F
+    deepest: real  # By the depth that another part may have
+    twists: Virtual  # By twists and virtual twists, of bodies on joints
 
 
 @wp.func

@@ -315,17 +315,11 @@ def add_tree_slopes(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
 
 @wp.struct
 class JointsMeasured:
-    """What a pass finds of the duals of joints.
+    """What a pass finds of the duals of joints."""
 
-    Attributes:
-        work: Of what their equations miss along the step [J].
-        error: Largest speed that they miss [rad/s or m/s].
-        size: Largest sum of the terms of one of their equations [rad/s or m/s].
-    """
-
-    work: real
-    error: real
-    size: real
+    work: real  # Of what their equations miss along the step [J]
+    error: real  # Largest speed that they miss [rad/s or m/s]
+    size: real  # Largest sum of the terms of one of their equations [rad/s or m/s]
 
 
 @wp.func

@@ -52,29 +52,17 @@ _GRAZING = wp.constant(real(0.05))
 
 @wp.struct
 class Thing:
-    """A solid somewhere.
+    """A solid somewhere."""
 
-    Attributes:
-        first: Its first leaf in `Solids`.
-        count: Number of leaves.
-        own_shadows: Whether it already shows the light that it takes from itself.
-        rotation: F → W.
-        position: Of the field frame [m, W].
-        centre: Of a ball around it [m, W].
-        radius: Of that ball [m].
-        low: Lower corner of a box around it [m, F].
-        high: Upper corner [m, F].
-    """
-
-    first: int
-    count: int
-    own_shadows: int
-    rotation: mat33
-    position: vec3
-    centre: vec3
-    radius: real
-    low: vec3
-    high: vec3
+    first: int  # Its first leaf in `Solids`
+    count: int  # Number of leaves
+    own_shadows: int  # Whether it already shows the light that it takes from itself
+    rotation: mat33  # F → W
+    position: vec3  # Of the field frame [m, W]
+    centre: vec3  # Of a ball around it [m, W]
+    radius: real  # Of that ball [m]
+    low: vec3  # Lower corner of a box around it [m, F]
+    high: vec3  # Upper corner [m, F]
 
 
 @wp.struct
@@ -144,15 +132,10 @@ def meets_ball(thing: Thing, o: vec3, d: vec3) -> bool:
 
 @wp.struct
 class Cone:
-    """Some rays from one point together.
+    """Some rays from one point together."""
 
-    Attributes:
-        axis: Their mean direction, a unit vector [W].
-        width: Greatest distance of a unit direction from it.
-    """
-
-    axis: vec3
-    width: real
+    axis: vec3  # Their mean direction, a unit vector [W]
+    width: real  # Greatest distance of a unit direction from it
 
 
 @wp.func
@@ -234,15 +217,10 @@ def normal_of(view: View, thing: Thing, x: vec3) -> vec3:
 
 @wp.struct
 class Shadow:
-    """What a thing takes from a light at a point.
+    """What a thing takes from a light at a point."""
 
-    Attributes:
-        left: Share of the light that it leaves.
-        steep: How much more of it at most it may hide, or show, a metre beside [1/m].
-    """
-
-    left: real
-    steep: real
+    left: real  # Share of the light that it leaves
+    steep: real  # How much more of it at most it may hide, or show, a metre beside [1/m]
 
 
 @wp.func
