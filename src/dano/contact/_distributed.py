@@ -93,8 +93,8 @@ class DistributedLaw(AbstractContactLaw):
 
     Default stiffness: set down on a rigid floor in a typical (the median) orientation, so on a corner, an
     edge or a bulge, under the weight of the heaviest body of the scene, a body sinks by 0.5 % of its size; on
-    a flat side by much less. Default restitution velocity: √(g · 0.5 % size)/5, small against impacts, large
-    against what is left of motion at rest.
+    a flat side by much less; where edges and faces meet a plane, by 0.01 %. Default restitution velocity:
+    √(g · 0.5 % size)/5, small against impacts, large against what is left of motion at rest.
 
     Attributes:
         stiction_velocity: v_s, slip up to which friction counts as sticking [m/s].
