@@ -75,7 +75,7 @@ def test_files_that_are_no_recordings_are_refused(tmp_path, name):
 
 def test_friction_turns_the_ellipse_against_the_sign_of_the_file(folder):
     impacts = Impacts.load(folder / "impacts.npz", slice(None))
-    rows = {row.name: row.value for row in _impacts._jacobian(impacts)}
+    rows = {row.name: row.value for row in _impacts._jacobian(impacts) if row.value is not None}
     assert 0.85 < rows["share of the normal impulse's moment in the spin"] < 1.1
     assert 0.85 < rows["share of friction's moment in the spin"] < 1.1
 

@@ -132,4 +132,6 @@ def _kept(block: Block, begin: float, angle: np.ndarray) -> float:
     if len(lands) == 0:
         return 0.0
     swing = angle[lands[0] + 1 : lands[1] if len(lands) > 1 else len(angle)]
-    return float(np.sqrt(np.maximum(block.energy(swing).max(initial=0.0), 0.0) / block.energy(begin)))
+    return float(
+        np.sqrt(np.maximum(block.energy(swing).max(initial=0.0), 0.0) / block.energy(np.array(begin)))
+    )

@@ -139,7 +139,8 @@ def built(tool: Tool) -> tuple[dano.NeuralObject, dano.objects.MassProperties]:
     """The tool of its parts by `dano.build_parts`, and mass properties of one material of the true mass."""
     import trimesh
 
-    mesh = trimesh.load(tool.mesh, process=True)
+    mesh = trimesh.load_mesh(tool.mesh, process=True)
+    assert isinstance(mesh, trimesh.Trimesh)
     pieces = [piece for piece in mesh.split(only_watertight=False) if abs(piece.volume) > _LEAST_VOLUME]
     pieces = sorted(pieces, key=lambda piece: -abs(piece.volume))
     pieces = [piece for piece in pieces if len(piece.faces) > 20]

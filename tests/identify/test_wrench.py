@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def place(t: np.ndarray) -> np.ndarray:
     return np.stack([0.1 * np.sin(4 * t), 0.1 * np.cos(5 * t), 0.05 * np.sin(6 * t)], axis=-1)
 
 
-def recorded(seconds=8.0, rate=250.0, points=POINTS, noise=(0.0, 0.0), still=False, seed=0):
+def recorded(seconds=8.0, rate=250.0, points=POINTS, noise=(0.0, 0.0), still=False, seed=0) -> dict[str, Any]:
     """Times, poses, forces and torques of point masses: m (a − g) of each, with a from differences."""
     t = np.arange(0, seconds, 1 / rate)
     path = (lambda s: np.zeros((len(s), 3))) if still else place

@@ -267,7 +267,7 @@ class Robot:
         scene: Scene,
         q: Mapping[str, Numbers] | str | None = None,
         v: Mapping[str, Numbers] | None = None,
-        **others: dict[str, Numbers],
+        **others: Mapping[str, Numbers],
     ) -> State:
         """A state of a scene with the robot: joints by name, and other bodies as in `Scene.initial_state`.
 
@@ -293,7 +293,7 @@ class Robot:
         scene: Scene,
         commands: Mapping[str, Numbers] | None = None,
         efforts: Mapping[str, Numbers] | None = None,
-        **others: dict[str, Numbers],
+        **others: Mapping[str, Numbers],
     ) -> Control:
         """Control of one step: actuators and joints by their names in the file.
 

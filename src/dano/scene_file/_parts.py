@@ -205,12 +205,15 @@ def materials_doubt(path: Path) -> str | None:
         mesh = trimesh.load(path, process=True)
     except Exception:  # each of trimesh's readers raises its own kinds; it was read and mended before
         return None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) > _MOST_FACES or not mesh.visual.defined:
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) > _MOST_FACES:
+        return None
+    if mesh.visual is None or not mesh.visual.defined:
         return None
     pieces = [piece for piece in mesh.split(only_watertight=True) if piece.volume > 0]
     volumes = np.array([piece.volume for piece in pieces])
     large = [k for k in range(len(pieces)) if volumes[k] > _NOTABLE * volumes.sum()]
-    colours = np.array([np.asarray(pieces[k].visual.face_colors)[:, :3].mean(axis=0) for k in large])
+    looks: list[Any] = [pieces[k].visual for k in large]
+    colours = np.array([np.asarray(look.face_colors)[:, :3].mean(axis=0) for look in looks])
     if len(large) < 2 or np.ptp(colours, axis=0).max() < _OTHER_COLOUR:
         return None
     volumes = volumes[large]
@@ -357,9 +360,9 @@ def _fits(parts: Sequence[Part], shapes: Sequence[AbstractShape], size: float) -
             said.append(
                 f"{a} and {b} overlap by {100 * share:.1f} % of {parts[inner].name}, which weighs twice"
             )
-    reached: np.ndarray = touches[0]
+    reached = touches[0]
     for _ in parts:
-        reached = touches[reached].any(axis=0)
+        reached = np.atleast_1d(touches[reached].any(axis=0))
     if not reached.all():
         loose = ", ".join(part.name for part, there in zip(parts, reached, strict=True) if not there)
         said.append(

@@ -8,7 +8,9 @@ from typing import Any, cast
 from dano.names import did_you_mean
 
 _OF_PAIRS = "; those of a pair stand in [[contacts]], of all pairs in [default_contact]"
-_ELSEWHERE = dict.fromkeys(("friction", "sliding_friction", "restitution", "stiffness"), _OF_PAIRS)
+_ELSEWHERE: dict[str, str] = dict.fromkeys(
+    ("friction", "sliding_friction", "restitution", "stiffness"), _OF_PAIRS
+)
 """What to say of keys that stand elsewhere in a scene file."""
 
 

@@ -144,9 +144,8 @@ def twists(log: WristLog) -> Twists:
     """
     step = float(np.median(np.diff(log.times)))
     half = int(np.clip(round(_SMOOTHED / step), _DEGREE, 25))
-    whole: np.ndarray = np.isfinite(
-        np.column_stack([log.position, log.orientation, log.force, log.torque])
-    ).all(axis=1)
+    given = np.column_stack([log.position, log.orientation, log.force, log.torque])
+    whole = np.atleast_1d(np.isfinite(given).all(axis=1))
     middle = np.arange(half, len(log.times) - half)
     near = middle[:, None] + np.arange(-half, half + 1)
     # A gap in time is no motion to fit a polynomial to.
