@@ -148,9 +148,8 @@ def build_parts(
         progress: Called with a description and the share done.
 
     Raises:
-        ValueError: If a part is no solid, or overlaps another by more than a tenth of its volume, or options
-        do
-            not fit.
+        ValueError: If a part is no solid, overlaps another by more than a tenth of its volume, or an option
+            does not fit.
     """
     parts = checked_items("parts", parts, Part)
     if not parts:

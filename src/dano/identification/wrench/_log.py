@@ -5,7 +5,7 @@ import os
 import re
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -182,7 +182,7 @@ def twists(log: WristLog) -> Twists:
     )
 
 
-def load_wrist_log(path: str | os.PathLike[str], *, frame: str = "sensor", **options) -> WristLog:
+def load_wrist_log(path: str | os.PathLike[str], *, frame: str = "sensor", **options: Any) -> WristLog:
     """Read a log of a wrist's sensor from a table (.csv, .txt).
 
     Columns: what `load_motion` reads of the sensor's pose (`time`, `x, y, z`, `qw, qx, qy, qz`, or as ROS has
