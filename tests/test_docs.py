@@ -22,7 +22,7 @@ PROGRAMS = {
     if (program := "\n".join(grab_code_blocks(page.read_text(encoding="utf-8"), lang="python")))
 }
 # Pages whose programs take a minute each to compile; what they show has tests of its own beside it.
-LONG = ("docs/arm.md", "docs/identify.md", "docs/joints.md", "docs/learn.md", "docs/robots.md")
+LONG = tuple(f"docs/{page}.md" for page in ("arm", "identify", "joints", "learn", "robots", "track"))
 # Packages that few have.
 NEEDS = {
     "docs/arm.md": ("pybullet_data",),
