@@ -216,3 +216,10 @@ def test_shapes_of_users_are_drawn():
     # From afar an ellipse.
     area = math.pi * 0.4 * 0.4 / 0.7 / (30 * camera.pixel_angle) ** 2
     assert seen.sum() == pytest.approx(area, rel=0.02)
+
+
+def test_threads_get_the_blocks_that_kernels_trace():
+    from dano.native._instances import instance
+    from dano.vision.drawing import _rays
+
+    assert _rays._BLOCK == instance(_rays._FEATURES, _rays._TRACING).BLOCK

@@ -56,12 +56,11 @@ def _leave(code: int, *, at_once: bool) -> NoReturn:
 
 def _run(argv: list[str], keep: bool) -> None:
     """Run a command; `keep`: keep what it compiles."""
-    from dano.cli._parse import parse
+    from dano.cli._parse import parse, run
 
     command = parse(argv)
     import jax
 
-    from dano.cli._commands import run
     from dano.cli._console import say
     from dano.cli._outputs import named
     from dano.programs import keep_programs

@@ -1,7 +1,11 @@
-"""From the words on the command line to the command that they ask for."""
+"""From the words on the command line to the command that they ask for, and what runs it.
+
+Commands know nothing of what runs them.
+"""
 
 import contextlib
 import dataclasses
+import importlib
 import inspect
 import io
 import re
@@ -36,39 +40,46 @@ from dano.names import did_you_mean
 
 
 class _Row(NamedTuple):
-    """A command: its arguments, and what a user would type first."""
+    """A command: its arguments, what runs it, and what a user would type first."""
 
     kind: type
+    runner: str  # Module of `dano.cli` and function, imported when the command runs
     example: str
 
 
 GROUPS: dict[str, dict[str, _Row]] = {
     "Most used": {
-        "demo": _Row(Demo, "dano demo"),
-        "train": _Row(Train, "dano train photos/"),
-        "simulate": _Row(Simulate, "dano simulate mug.dano --video mug.mp4"),
-        "view": _Row(View, "dano view mug_run.npz"),
-        "inspect": _Row(Inspect, "dano inspect mug.dano"),
+        "demo": _Row(Demo, "_scenes:demo", "dano demo"),
+        "train": _Row(Train, "_learn:train", "dano train photos/"),
+        "simulate": _Row(Simulate, "_scenes:simulate", "dano simulate mug.dano --video mug.mp4"),
+        "view": _Row(View, "_scenes:view", "dano view mug_run.npz"),
+        "inspect": _Row(Inspect, "_objects:inspect", "dano inspect mug.dano"),
     },
     "From photographs and films": {
-        "film": _Row(Film, "dano film walk/ slide.mp4 --marker-size 0.08 -o soap.dano"),
-        "poses": _Row(Poses, "dano poses photos/ --marker-size 0.05"),
-        "data": _Row(Data, "dano data photos/"),
-        "track": _Row(Track, "dano track throw.mp4 mug.dano --camera camera.json"),
+        "film": _Row(Film, "film._run:film", "dano film walk/ slide.mp4 --marker-size 0.08 -o soap.dano"),
+        "poses": _Row(Poses, "_learn:poses", "dano poses photos/ --marker-size 0.05"),
+        "data": _Row(Data, "_learn:data", "dano data photos/"),
+        "track": _Row(Track, "tracking.run:track", "dano track throw.mp4 mug.dano --camera camera.json"),
     },
     "From fields, and to other programs": {
-        "build": _Row(Build, "dano build my_nerf.npz --length 0.12 --mass 0.35"),
-        "import": _Row(Import, "dano import step-000029999.ckpt --crop -1 -1 -1 1 1 1"),
-        "export": _Row(Export, "dano export mug.dano --to mjcf urdf"),
-        "compare": _Row(Compare, "dano compare mug.dano"),
+        "build": _Row(Build, "_objects:build", "dano build my_nerf.npz --length 0.12 --mass 0.35"),
+        "import": _Row(
+            Import, "_import:import_field", "dano import step-000029999.ckpt --crop -1 -1 -1 1 1 1"
+        ),
+        "export": _Row(Export, "_export:export", "dano export mug.dano --to mjcf urdf"),
+        "compare": _Row(Compare, "_compare:compare", "dano compare mug.dano"),
     },
     "With scenes": {
-        "check": _Row(Check, "dano check scene.toml"),
-        "identify": _Row(Identify, "dano identify scene.toml throw.npz -p mug,table.sliding_friction:0:1"),
-        "plan": _Row(Plan, "dano plan scene.toml task.toml --video plan.mp4"),
+        "check": _Row(Check, "checking._run:check", "dano check scene.toml"),
+        "identify": _Row(
+            Identify,
+            "identifying.run:identify",
+            "dano identify scene.toml throw.npz -p mug,table.sliding_friction:0:1",
+        ),
+        "plan": _Row(Plan, "planning:plan", "dano plan scene.toml task.toml --video plan.mp4"),
     },
     "This program": {
-        "cache": _Row(Cache, "dano cache objects --limit 500MB"),
+        "cache": _Row(Cache, "_cache:cache", "dano cache objects --limit 500MB"),
     },
 }
 """Commands in the order in which `dano --help` shows them: most used first."""
@@ -77,7 +88,7 @@ _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 
 
 def parse(argv: Sequence[str]) -> Any:
-    """The command that the arguments ask for, ready to be called.
+    """The command that the arguments ask for.
 
     Exits with code 0 after printing help.
 
@@ -121,6 +132,13 @@ def parse(argv: Sequence[str]) -> Any:
     options = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(row.kind)]
     hint = did_you_mean(unknown[1], options) if unknown else ""
     raise ValueError(f"{text}{hint}; see dano {words[0]} --help")
+
+
+def run(command: Any) -> None:
+    """Run a command that `parse` returned."""
+    (runner,) = (row.runner for row in _COMMANDS.values() if row.kind is type(command))
+    module, function = runner.split(":")
+    getattr(importlib.import_module(f"dano.cli.{module}"), function)(command)
 
 
 def _unboxed(box: str) -> str:

@@ -59,8 +59,7 @@ def _shown(value: Any) -> str:
 
 # One thread makes instances, the others wait for them.
 # Python 3.11 counts depths of trees of code in one place, and fails where two threads parse at once.
-making = threading.RLock()
-"""Held while modules are made, or their text is parsed."""
+_making = threading.RLock()
 
 
 def instance(features: Features, module: str) -> ModuleType:
@@ -71,7 +70,7 @@ def instance(features: Features, module: str) -> ModuleType:
         module: Its usual name.
     """
     begin()
-    with making:
+    with _making:
         return _instance(features, module)
 
 

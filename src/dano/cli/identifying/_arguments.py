@@ -17,8 +17,7 @@ class Identify:
 
     Attributes:
         scene: Scene file (.toml). Or a wrist's log (.csv) with nothing else: time, the sensor's pose (x, y,
-        z,
-            qw, qx, qy, qz), fx, fy, fz [N] and mx, my, mz [N m].
+            z, qw, qx, qy, qz), fx, fy, fz [N] and mx, my, mz [N m].
         motions: Observed motions (.npz, .csv, .txt, .tum): times [s], positions [m], quaternions. The guide
             "Identification" lists the columns.
         parameter: Unknown parameters, each as NAME:LOWER:UPPER or NAME:LOWER:UPPER:START, e.g.

@@ -1,12 +1,11 @@
 """`dano identify` of what a wrist holds."""
 
 import json
-import warnings
 from typing import Any
 
 import numpy as np
 
-from dano.archive import checked_output, replacing
+from dano.archive import checked_output, write_text
 from dano.cli._console import numbers, put, put_json, say
 from dano.cli.identifying._arguments import Identify
 from dano.identification import identify_load, Load, load_wrist_log
@@ -35,16 +34,11 @@ def identify_held(command: Identify) -> None:
             raise ValueError(f"output must be a .json file, got {command.output}")
         checked_output(command.output)
     options = {"rate": command.rate, "time_unit": command.time_unit, "length_unit": command.length_unit}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        log = load_wrist_log(command.scene, frame=command.frame, **options)
-    for each in caught:
-        say(f"warning: {each.message}")
+    log = load_wrist_log(command.scene, frame=command.frame, **options)
     found = identify_load(log)
     result = {"log": str(command.scene), "rows": len(log.times), **_numbers(found)}
     if command.output is not None:
-        with replacing(command.output) as file:
-            file.write((json.dumps(result, indent=2, ensure_ascii=False) + "\n").encode())
+        write_text(command.output, json.dumps(result, indent=2, ensure_ascii=False) + "\n")
     if command.json:
         put_json(result)
     else:

@@ -8,7 +8,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from dano import scene_file
-from dano.archive import checked_output, replacing
+from dano.archive import checked_output, write_text
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import missing_for_pictures
@@ -75,8 +75,7 @@ def identify(command: Identify) -> None:
         **({} if seen is None else {"film": seen.numbers(command)}),
     }
     if command.output is not None:
-        with replacing(command.output) as file:
-            file.write((json.dumps(result, indent=2, ensure_ascii=False) + "\n").encode())
+        write_text(command.output, json.dumps(result, indent=2, ensure_ascii=False) + "\n")
     stopped = interrupted() or any(minimum.stop is Stop.INTERRUPTED for minimum in fit.minima)
     if command.report is not None and not stopped:
         progress("drawing", 0.0)

@@ -134,8 +134,8 @@ def identify_load(log: WristLog, *, gravity: Numbers = (0.0, 0.0, -9.81)) -> Loa
         if other.noise[0] < _BETTER * fit.noise[0]:
             raise ValueError(
                 "force and torque must be in the sensor's axes: those of this log fit in world axes, with"
-                " a noise"
-                f" of {other.noise[0]:.2g} N in place of {fit.noise[0]:.2g} N; frame='world' reads them so"
+                f" a noise of {other.noise[0]:.2g} N in place of {fit.noise[0]:.2g} N; frame='world' reads"
+                " them so"
             )
     rows, fit = _drifting(rows, fit, messages)
     if fit.theta[0] < 0:
@@ -239,8 +239,7 @@ def _drifting(rows: _Rows, fit: _Fit, messages: list[str]) -> tuple[_Rows, _Fit]
     change = drifting.theta[16:22]
     messages.append(
         f"the bias drifts, by {np.linalg.norm(change[:3]):.2g} N and {np.linalg.norm(change[3:]):.2g} N m"
-        f" over the"
-        " log: estimated along with the rest"
+        " over the log: estimated along with the rest"
     )
     return longer, drifting
 
@@ -258,8 +257,7 @@ def _check(log: WristLog, rows: _Rows, fit: _Fit) -> None:
     if (far := float(np.linalg.norm(arm / mass))) > _FAR:
         raise ValueError(
             f"torques must be in N m: with these the centre of mass is {far:.3g} m from the sensor;"
-            f" divide N mm by"
-            " 1000"
+            " divide N mm by 1000"
         )
     _check_units(rows, fit)
     best, when, shift = 0.0, 0.0, np.zeros(3)
@@ -273,8 +271,7 @@ def _check(log: WristLog, rows: _Rows, fit: _Fit) -> None:
         at = 0.5 * (log.times[0] + log.times[-1]) + when * (log.times[-1] - log.times[0])
         raise ValueError(
             f"the load must be held fast: its centre of mass moves by {1e3 * way:.2g} mm in the gripper"
-            f" at about"
-            f" {at:.3g} s; take the part of the log before or after it (WristLog.part)"
+            f" at about {at:.3g} s; take the part of the log before or after it (WristLog.part)"
         )
 
 
@@ -293,8 +290,7 @@ def _check_units(rows: _Rows, fit: _Fit) -> None:
     if split.noise[1] < _BETTER * fit.noise[1] and not 1 / _UNLIKE < ratio < _UNLIKE:
         raise ValueError(
             f"torques must be in N m, about the sensor's origin: they speak of a centre of mass"
-            f" {ratio:.3g} times as"
-            " far away as forces do; divide N mm by 1000"
+            f" {ratio:.3g} times as far away as forces do; divide N mm by 1000"
         )
 
 

@@ -27,12 +27,12 @@ from dano.vision.radiance import (
     composite,
     DRAWING,
     Picture,
+    pixel_order,
     Sampling,
     section_weights,
     sections,
     Share,
     stratified_edges,
-    tiles,
     transmittance,
 )
 
@@ -211,7 +211,7 @@ def compose(
     lamps = tuple(tuple(own.get(i, common)) for i in numbers)
     directions = camera.rays().reshape(-1, 3).astype(np.float32)
     origin = camera.position.astype(np.float32)
-    order = tiles(camera.width, camera.height)
+    order, _ = pixel_order(camera.width, camera.height)
     pixels = order[_may_meet([item for _, item in things], floors, origin, directions[order])]
     n = len(directions)
     columns = np.zeros((n, 3), np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32), np.full(n, -1)

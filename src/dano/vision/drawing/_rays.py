@@ -98,7 +98,8 @@ class Tracer:
 
         Args:
             directions: Of the rays; neighbours share much of the work if they stand together.
-            regular: How many of them, from the first on, come in blocks of 4 × 4 pixels: see `pixel_order`.
+            regular: How many of them, from the first on, come in blocks of 4 × 4 pixels: see
+                `dano.vision.radiance.pixel_order`.
         """
         n = directions.shape[1]
         rays = np.ascontiguousarray(directions.T, np.float32)
@@ -151,19 +152,6 @@ class Painter:
         }
         _launch(self._kernel, self._arrays, self._numbers, arrays)
         return np.ascontiguousarray(colours.T), picture
-
-
-def pixel_order(width: int, height: int) -> tuple[Int[np.ndarray, " pixels"], int]:
-    """Indices of the pixels of a picture, neighbours together, and how many of them come in whole blocks.
-
-    Blocks have 4 × 4 pixels in Morton order; what is left at the right and lower border comes last.
-    """
-    y, x = np.mgrid[:height, :width]
-    left = (y >= height // 4 * 4) | (x >= width // 4 * 4)
-    inner = (x % 2) + 2 * (y % 2) + 4 * (x // 2 % 2) + 8 * (y // 2 % 2)
-    blocks = (y // 16) * (width // 16 + 1) + x // 16
-    order = np.lexsort([each.ravel() for each in (inner, x // 4, y // 4, blocks, left)])
-    return order, int(np.sum(~left))
 
 
 def compile_kernels() -> None:

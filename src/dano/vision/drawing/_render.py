@@ -27,13 +27,12 @@ from dano.vision.drawing._rays import (
     compile_kernels,
     Met,
     Painter,
-    pixel_order,
     Thing,
     Tracer,
     transmitted,
 )
 from dano.vision.drawing._shade import GAMMA, lamps_of, Surroundings, to_picture
-from dano.vision.radiance import Sampling
+from dano.vision.radiance import pixel_order, Sampling
 
 # Half the angular width of the lamp [rad]: shadows are crisp where things touch and soft a length away.
 _LAMP = 0.07

@@ -17,7 +17,7 @@ from dano.vision.radiance._models import (
     SurfaceModel as SurfaceModel,
 )
 from dano.vision.radiance._osf import OSF as OSF
-from dano.vision.radiance._picture import Picture as Picture, picture as picture, tiles as tiles
+from dano.vision.radiance._picture import Picture as Picture, picture as picture, pixel_order as pixel_order
 from dano.vision.radiance._volume import (
     composite as composite,
     section_weights as section_weights,
