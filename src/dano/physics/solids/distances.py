@@ -39,7 +39,7 @@ class Solid:
     kind: LeafKind
 
 
-@wp.func
+@wp.func(inline=True)
 def leaf_distance(solids: Solids, world: int, kind: LeafKind, leaf: Leaf, x: vec3) -> Distance:
     """Of one leaf, at a point [m, F]."""
     y = (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position))
@@ -102,20 +102,39 @@ def nearest_leaf(solids: Solids, world: int, solid: Solid, x: vec3) -> Solid:
     return solid_of(solids, world, nearest, 1)
 
 
-@wp.func
-def solid_clearance(solids: Solids, world: int, solid: Solid, x: vec3, enough: real) -> real:
-    """Lower bound on the distance [m] from a point [m, F] to a solid; beyond `enough`, any that is, too."""
-    least = leaf_clearance(solids, world, solid.kind, solid.leaf, x, enough)
-    if wp.static(UNIONS):
-        for i in range(solid.first + 1, solid.first + solid.count):
-            other = leaf_clearance(solids, world, solids.kinds[i], solids.leaves[world, i], x, enough)
-            least = wp.min(least, other)
+@wp.func(inline=False)
+def clearance_of_others(
+    solids: Solids, world: int, solid: Solid, x: vec3, enough: real, clearance: real
+) -> real:
+    """Of all leaves, from the clearance of the first one [m]."""
+    least = clearance
+    for i in range(solid.first + 1, solid.first + solid.count):
+        other = leaf_clearance(solids, world, solids.kinds[i], solids.leaves[world, i], x, enough)
+        least = wp.min(least, other)
     return least
 
 
 @wp.func
+def solid_clearance(solids: Solids, world: int, solid: Solid, x: vec3, enough: real) -> real:
+    """Lower bound on the distance [m] from a point [m, F] to a solid; beyond `enough`, any that is, too."""
+    clearance = leaf_clearance(solids, world, solid.kind, solid.leaf, x, enough)
+    if wp.static(UNIONS):
+        if solid.count > 1:
+            return clearance_of_others(solids, world, solid, x, enough, clearance)
+    return clearance
+
+
+@wp.func(inline=False)
+def union_distance(solids: Solids, world: int, solid: Solid, x: vec3) -> Distance:
+    """Of the nearest leaf, at a point [m, F]."""
+    nearest = nearest_leaf(solids, world, solid, x)
+    return leaf_distance(solids, world, nearest.kind, nearest.leaf, x)
+
+
+@wp.func(inline=True)
 def solid_distance(solids: Solids, world: int, solid: Solid, x: vec3) -> Distance:
     """Signed distance of a solid and its gradient at a point [m, F]; of a union, of its nearest leaf."""
     if wp.static(UNIONS):
-        solid = nearest_leaf(solids, world, solid, x)
+        if solid.count > 1:
+            return union_distance(solids, world, solid, x)
     return leaf_distance(solids, world, solid.kind, solid.leaf, x)

@@ -165,7 +165,7 @@ def adj_ellipsoid_root(x: vec3, semi_axes: vec3, adj_ret: real):
     wp.adjoint[semi_axes] += by_a
 
 
-@wp.func
+@wp.func(inline=False)
 def ellipsoid_distance(leaf: Leaf, y: vec3) -> Distance:
     """Distance t |y/(t + a²)|, with a² y/(t + a²) on the surface (Eberly, *Distance to an ellipsoid*)."""
     d = Distance()
