@@ -81,6 +81,19 @@ def test_friction_of_a_simulated_slide(truth):
     assert f"{fit.values['mu']:.4g} ± " in shown and "<polyline" in shown
 
 
+def test_positions_alone_with_noise_of_positions_alone(truth):
+    """Orientations of the start are estimated although nothing says how well: as well as usual."""
+    seen = dano.Motion.create(
+        truth.times[::2],
+        ["ball"],
+        position=np.asarray(truth.states.position)[::2, :1]
+        + 1e-4 * np.random.default_rng(0).normal(size=(21, 1, 3)),
+    )
+    with pytest.warns(UserWarning, match="orientations of 'ball' were not observed"):
+        fit = dano.identify(ball_scene(), seen, [FRICTION], initial="states", noise={"position": 1e-4})
+    assert abs(fit.values["mu"] - 0.25) < 3 * fit.standard_errors["mu"] < 0.03
+
+
 def test_several_motions_of_different_length_rate_and_gaps(truth, observed):
     gaps = observed.position.copy()
     gaps[5:9] = np.nan

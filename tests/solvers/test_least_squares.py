@@ -254,3 +254,13 @@ def test_loss_that_is_not_finite_at_the_start():
     bad = lambda x: np.array([np.nan, 0.0]), lambda x: np.eye(2)
     with pytest.raises(ValueError, match="finite at the start"):
         solve(bad, (0.0, 0.0), (-1, -1), (1, 1))
+
+
+def test_derivatives_that_are_not_finite():
+    """At the start they are an error by name; further on, such a step is rejected."""
+    bad = lambda x: x - 2.0, lambda x: np.full((2, 2), np.nan)
+    with pytest.raises(ValueError, match="derivatives of the loss must be finite at the start"):
+        solve(bad, (0.0, 0.0), (-9, -9), (9, 9))
+    cliff = lambda x: x - 2.0, lambda x: np.eye(2) * (np.nan if x[0] > 1.0 else 1.0)
+    found = solve(cliff, (0.0, 0.0), (-9, -9), (9, 9))
+    assert found.x[0] <= 1.0 and np.isfinite(found.normal.gradient).all()

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +16,7 @@ from dano.identification._checkpoint import Checkpoint
 from dano.identification._planes import Smoothing
 from dano.identification._residuals import Linearized, linearized, losses, Model, moved, shifted, Start
 from dano.identification._result import Identification
-from dano.identification._settings import Setup
+from dano.identification._settings import Setup, start_deviations
 from dano.identification._settling import settled
 from dano.identification._windows import draw_velocities, plan_windows
 from dano.identification.motions import Motion, QUANTITIES
@@ -58,6 +58,7 @@ class Problem:
         space, scene, controls, initial = setup.space, setup.scene, setup.controls, setup.initial
         noise, options = setup.noise, setup.options
         self.space, self.noise, self.seed = space, noise, options.seed
+        self._usual = functools.partial(start_deviations, scene, motions, noise)
         self.ties = options.gaps
         self.spacing = float(np.median(np.concatenate([np.diff(motion.times) for motion in motions])))
         self.simulations = 0
@@ -103,7 +104,7 @@ class Problem:
         if self.ties:
             # Velocities that were not observed may miss by what would move a window's end by the noise.
             span = max(1e-6, float(self.plan.n_steps * scene.timestep))
-            self.jumps = jnp.asarray(self.start.widths(_usual(noise, span)), dtype)
+            self.jumps = jnp.asarray(self.start.widths(self._usual(span)), dtype)
         self.model = Model(
             scene,
             policy,
@@ -206,7 +207,7 @@ class Problem:
     def start_widths(self) -> np.ndarray:
         """By how much initial states are uncertain, of their unknowns, as the noise says."""
         span = max(1e-6, float(self.plan.n_steps * self.model.scene.timestep))
-        return self.start.deviations(_usual(self.noise, span))
+        return self.start.deviations(self._usual(span))
 
     def retract(self, start: State, change: np.ndarray) -> State:
         """Initial states moved by the change of all blocks."""
@@ -413,16 +414,6 @@ class Problem:
 
     def _by_motion(self, found: Linearized) -> np.ndarray:
         return by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
-
-
-def _usual(noise: Mapping[str, float], span: float) -> list[float]:
-    """Deviations of the four quantities; velocities as poses a time [s] apart tell them, or better."""
-    usual = {**dict.fromkeys(QUANTITIES, np.inf), **noise}
-    if "q" in noise:
-        usual |= {key: min(usual[key], noise["q"]) for key in ("position", "orientation")}
-    for slow, fast in (("position", "velocity"), ("orientation", "omega")):
-        usual[fast] = min(usual[fast], usual[slow] / span)
-    return [usual[key] for key in QUANTITIES]
 
 
 def _following(start: State) -> State:

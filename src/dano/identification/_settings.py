@@ -153,10 +153,7 @@ def deviations(
     if noise is None and all(m.q is not None for m in motions):
         return {"q": 1e-3}
     if noise is None:
-        sizes = [scene.body(name).size for m in motions for name in m.names if name in scene.names]
-        finite = [size for size in sizes if np.isfinite(size)] or [1.0]
-        # A thousandth of the size, seen at half the size from the middle.
-        poses = {"position": 1e-3 * float(np.mean(finite)), "orientation": 2e-3}
+        poses = _of_poses(scene, motions)
         return {**poses, "q": 1e-3} if joints else poses
     checked_kind("noise", noise, Mapping, hint="; such as {'position': 0.001} [m]")
     for key, value in noise.items():
@@ -171,3 +168,33 @@ def deviations(
             "poses follow from them and do not count"
         )
     return dict(noise)
+
+
+def start_deviations(
+    scene: Scene, motions: Sequence[Motion], noise: Mapping[str, float], span: float
+) -> list[float]:
+    """Standard deviations of the four quantities of an initial state, in their order.
+
+    Velocities are as poses a time apart tell them, or better. What is estimated and has no noise, such as
+    orientations of a log that holds positions alone, has the usual one.
+
+    Args:
+        scene: The scene.
+        motions: What was observed.
+        noise: Standard deviations of the quantities that count.
+        span: The time [s].
+    """
+    found = {**dict.fromkeys(QUANTITIES, np.inf), **_of_poses(scene, motions), **noise}
+    if "q" in noise:
+        found |= {key: min(found[key], noise["q"]) for key in ("position", "orientation")}
+    for slow, fast in (("position", "velocity"), ("orientation", "omega")):
+        found[fast] = min(found[fast], found[slow] / span)
+    return [found[key] for key in QUANTITIES]
+
+
+def _of_poses(scene: Scene, motions: Sequence[Motion]) -> dict[str, float]:
+    """Standard deviations of poses where none are stated."""
+    sizes = [scene.body(name).size for m in motions for name in m.names if name in scene.names]
+    finite = [size for size in sizes if np.isfinite(size)] or [1.0]
+    # A thousandth of the size, seen at half the size from the middle.
+    return {"position": 1e-3 * float(np.mean(finite)), "orientation": 2e-3}

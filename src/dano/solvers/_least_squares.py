@@ -144,7 +144,8 @@ def bounded_least_squares(
     """Minimise a sum of squares within bounds.
 
     Args:
-        linearize: The normal equations at (x, blocks); a step to where the loss is not finite is rejected.
+        linearize: The normal equations at (x, blocks); a step to where it or its
+            derivatives are not finite is rejected.
             After a poor step it is called with the same x again, and other values of some blocks.
         start: First x, shape (p,).
         lower: Bounds, shape (p,); may be −∞.
@@ -160,8 +161,8 @@ def bounded_least_squares(
         since: What `keep` was called with: the minimisation goes on there as if it had never stopped.
 
     Raises:
-        ValueError: If shapes differ, a bound is NaN or crossed, the start lies outside, or the loss is not
-            finite there.
+        ValueError: If shapes differ, a bound is NaN or crossed, the start lies outside, or the loss or its
+            derivatives are not finite there.
     """
     x, lower, upper = _checked(start, lower, upper)
     span = _span(x, lower, upper)
@@ -203,13 +204,15 @@ def _begun(linearize, x: np.ndarray, blocks: Any, since: Iterate | None) -> tupl
     """Where the first step begins, and the model there.
 
     Raises:
-        ValueError: If the loss is not finite there.
+        ValueError: If the loss or its derivatives are not finite there.
     """
     if since is not None:
         return since, linearize(since.x, since.blocks)
     normal = linearize(x, blocks)
     if not np.isfinite(normal.loss):
         raise ValueError(f"loss must be finite at the start {x.tolist()}, got {normal.loss}")
+    if not _is_finite(normal):
+        raise ValueError(f"derivatives of the loss must be finite at the start {x.tolist()}, got others")
     return Iterate(x, blocks, (float(normal.loss),), _DAMPING, 2.0, 0, _scales(normal), 1), normal
 
 
@@ -411,8 +414,13 @@ def _promised(normal: NormalEquations, change: np.ndarray, block_change: np.ndar
 
 
 def _gain(normal: NormalEquations, following: NormalEquations, promised: float) -> float:
-    """The share of the promised fall of the loss that came true; −∞ where the loss is not finite."""
-    return (normal.loss - following.loss) / promised if np.isfinite(following.loss) else -np.inf
+    """The share of the promised fall of the loss that came true; −∞ where the model is not finite."""
+    return (normal.loss - following.loss) / promised if _is_finite(following) else -np.inf
+
+
+def _is_finite(normal: NormalEquations) -> bool:
+    """Whether loss and derivatives are; without the latter there is no next step."""
+    return all(bool(np.all(np.isfinite(part))) for part in normal)
 
 
 def _worse(normal: NormalEquations, following: NormalEquations, promised: float) -> np.ndarray:
