@@ -270,13 +270,51 @@ def test_windows_of_any_shape_open_on_all(width, filled, level):
     places = np.random.default_rng(0).normal(size=(40, 3)) * (1.0, 1.0, 0.2)
     opening = open_on(server, places, np.zeros(40), 0.05, level=level)
     start = server.initial_camera
-    window = SimpleNamespace(aspect=width / 100, position=start.position, look_at=start.look_at)
+    window = SimpleNamespace(
+        aspect=width / 100, image_width=1000, fov=start.fov, position=start.position, look_at=start.look_at
+    )
     opening.choose(SimpleNamespace(camera=window))
     camera = Camera(window.position, window.look_at, vertical_fov=start.fov, width=width, height=100)
     seen = camera.project(places)[:, :2]
     assert seen.min() > 0 and (seen.max(axis=0) < (width, 100)).all()
     # Near: what is seen fills so much of the window in one direction.
     assert (np.ptp(seen, axis=0) / (width, 100)).max() > filled
+
+
+def test_a_phone_shows_the_picture_above_the_controls():
+    server = SimpleNamespace(initial_camera=SimpleNamespace(), on_client_connect=lambda _: None)
+    places = np.random.default_rng(0).normal(size=(40, 3)) * (1.0, 1.0, 0.2)
+    opening = open_on(server, places, np.zeros(40), 0.05)
+    start = server.initial_camera
+    window = SimpleNamespace(
+        aspect=0.46, image_width=390, fov=start.fov, position=start.position, look_at=start.look_at
+    )
+    opening.choose(SimpleNamespace(camera=window))
+    camera = Camera(window.position, window.look_at, vertical_fov=start.fov, width=46, height=100)
+    seen = camera.project(places)[:, 1]
+    assert seen.min() > 0 and seen.max() < 40
+
+
+def test_arrows_of_forces_are_one_node_that_changes(fall):
+    """A node that is added in each frame is not there yet when a slow browser draws the frame."""
+    pytest.importorskip("viser")
+    scene, _ = fall
+    run = dano.simulate(scene, scene.initial_state(ball=dict(position=(0, 0, 0.06))), 40)
+    shown = []
+
+    def fill(server):
+        drawn = Drawn(server, scene, run, {}, None)
+        for time in (0.0, float(run.times[-1]), 0.0, float(run.times[-2])):
+            drawn.show(time, Shown())
+            arrows = drawn._forces
+            shown.append((arrows, arrows is not None and arrows.visible, arrows and arrows.points))
+        return None
+
+    serve(fill, port=free_port(), host="127.0.0.1", block=False).stop()
+    assert [visible for _, visible, _ in shown] == [False, True, False, True]
+    assert shown[1][0] is shown[3][0]
+    # It comes out of the ball, which hides what is inside.
+    assert shown[3][2][0, 1, 2] > 2 * 0.05
 
 
 def test_learned_colours_are_linear_in_meshes():

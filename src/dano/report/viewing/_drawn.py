@@ -18,6 +18,9 @@ from dano.vision import checked_colour, Item, LearnedField, PALETTE
 _GHOST = 0.35
 """Opacity of the bodies of a second run."""
 
+_ARROW = 4.0
+"""Length of the arrow of a usual force, in 0.3 sizes: it comes out of a body that is pushed from below."""
+
 _TRAIL = 200
 """Points of a trail."""
 
@@ -65,6 +68,7 @@ class Drawn:
         self._scene.set_up_direction("+z")
         self._place(scene, looks)
         self.opening = self._aim(scene)
+        # One node for the whole run: one that is added anew in each frame comes too late in slow browsers.
         self._forces: Any = None
         self._extras: list[Any] = []
         self.replace(scene, trajectory)
@@ -124,15 +128,12 @@ class Drawn:
             self._show_forces(time, shown.contacts)
 
     def _show_forces(self, time: float, wanted: bool) -> None:
-        if self._forces is not None:
-            self._forces.remove()
-            self._forces = None
-        if self.touched is None or not wanted:
-            return
-        times = self.numbers.times
-        ends = _arrow_ends(self.touched, int(np.searchsorted(times, time, side="right") - 1), self._length)
-        if len(ends):
-            thick = 0.03 * self._length
+        ends = np.zeros((0, 2, 3))
+        if self.touched is not None and wanted:
+            step = int(np.searchsorted(self.numbers.times, time, side="right") - 1)
+            ends = _arrow_ends(self.touched, step, _ARROW * self._length)
+        if len(ends) and self._forces is None:
+            thick = 0.04 * self._length
             self._forces = self._scene.add_arrows(
                 "/forces",
                 ends.astype(np.float32),
@@ -141,6 +142,10 @@ class Drawn:
                 head_radius=2.5 * thick,
                 head_length=6 * thick,
             )
+        elif self._forces is not None:
+            self._forces.visible = len(ends) > 0
+            if len(ends):
+                self._forces.points = ends.astype(np.float32)
 
     def show_extras(self, shown: Shown) -> None:
         """Draw trails, and centres of mass with principal axes, or take them away."""

@@ -11,6 +11,9 @@ from dano.vision import Camera
 _WIDE, _UPRIGHT = (3, 2), (1, 2)
 """Width and height of the windows that the two cameras are made for (convention)."""
 
+_NARROW, _COVERED = 576, 0.6
+"""In windows up to so wide [px] viser's controls cover that share of the height, from below (viser 1.1)."""
+
 _CHOICE = """<script>
 (() => {
   const start = "START", query = new URLSearchParams(location.search), shape = innerWidth / innerHeight;
@@ -56,14 +59,24 @@ class Opening(NamedTuple):
         return before + head + _CHOICE.replace('"START"', json.dumps(start), 1) + after
 
     def choose(self, client: Any) -> None:
-        """Move the camera of a window that has just been opened, if it is upright."""
-        shape = client.camera.aspect
+        """Move the camera of a window that has just been opened, if it is upright.
+
+        On a phone what is shown is above the controls, not behind them.
+        """
+        camera, shape = client.camera, client.camera.aspect
         if shape >= 1 or shape <= 0:
             return
         back = max(1.0, _UPRIGHT[0] / _UPRIGHT[1] / shape)
-        client.camera.position = self.upright.look_at + back * (self.upright.position - self.upright.look_at)
+        ahead = self.upright.look_at - self.upright.position
+        lower = np.zeros(3)
+        if camera.image_width <= _NARROW:
+            right = np.cross(ahead, (0.0, 0.0, 1.0))
+            above = np.cross(right, ahead)
+            half = back * float(np.linalg.norm(ahead)) * np.tan(0.5 * camera.fov)
+            lower = -_COVERED * half * above / max(float(np.linalg.norm(above)), 1e-12)
+        camera.position = self.upright.look_at - back * ahead + lower
         # Moving a camera moves what it looks at.
-        client.camera.look_at = self.upright.look_at
+        camera.look_at = self.upright.look_at + lower
 
 
 def open_on(

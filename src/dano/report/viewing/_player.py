@@ -46,8 +46,13 @@ class Player:
         self._contacts = gui.add_checkbox("contact forces", self._drawn.touched is not None)
         self._trails = gui.add_checkbox("trails", False)
         self._centres = gui.add_checkbox("centres of mass, principal axes", False)
+        dark = gui.add_checkbox("dark", False)
         self._plots: list[Any] = []
         self._plot()
+
+        @dark.on_update
+        def _(_: Any) -> None:
+            gui.configure_theme(dark_mode=dark.value)
 
         @self._slider.on_update
         def _(event: Any) -> None:
