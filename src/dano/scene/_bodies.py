@@ -149,7 +149,9 @@ class Body(eqx.Module):
         self.name = checked_text("name", name)
         self.fixed, self.weighed = bool(fixed), bool(weighed)
         self.material = checked_optional(f"material of body {name!r}", material, ContactParams)
-        self.samples = self.support = self.surface = self.extent = self.object = self.shape = None
+        # One by one: of a chain, pages of the API give all the annotation of the first.
+        self.shape, self.object, self.samples = None, None, None
+        self.support, self.surface, self.extent = None, None, None
         self.density_scale = floating(1.0)
         if isinstance(geometry, NeuralObject):
             self.object = geometry
