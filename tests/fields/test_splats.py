@@ -1,7 +1,9 @@
 """Gaussian splats: one object out of a scene, moved with its colours, and written for others."""
 
+import dataclasses
 import json
 import math
+import shlex
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,9 @@ from dano.fields import load_field, read_splats, Splats
 from dano.fields.readers._gaussians import harmonics
 from dano.maths import Pose
 from dano.objects import fill_hollows, node_values
+from dano.report import view_splats
+from dano.report.viewing._serving import serve
+from dano.report.viewing._splats import Choice, struck
 
 pytest.importorskip("plyfile")
 RADIUS, CENTRE = 0.05, np.array([0.2, -0.1, 0.06])
@@ -201,3 +206,56 @@ def test_newton_draws_them(folder):
     kinds = list(builder.shape_type)
     assert newton.GeoType.GAUSSIAN in kinds
     assert builder.body_mass[0] == pytest.approx(0.3, rel=1e-6)
+
+
+def test_a_ray_meets_what_is_seen_first():
+    """One opaque Gaussian before another: at its middle; beside both nothing."""
+    sigma = 0.01
+    two = Splats(
+        means=np.array([[0.0, 0, 0], [0.0, 0, 0.2], [0.0, 0.0, -0.3]]),
+        scales=np.log(np.full((3, 3), sigma)),
+        quats=np.tile([1.0, 0, 0, 0], (3, 1)),
+        opacities=np.full(3, 5.0),
+        colours=np.zeros((3, 1, 3)),
+    )
+    down = np.array([0.0, 0, -1])
+    np.testing.assert_allclose(struck(two, np.array([0.005, 0, 1.0]), down), (0.005, 0, 0.2), atol=1e-12)
+    # Behind the first one, and from between them upwards.
+    np.testing.assert_allclose(struck(two, np.array([0.0, 0, 0.1]), down), (0, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(struck(two, np.array([0.0, 0, 0.1]), -down), (0, 0, 0.2), atol=1e-12)
+    assert struck(two, np.array([0.02, 0, 1.0]), down) is None
+    # Opacity α lets 1 − α through: 0.7² is the first below a half.
+    thin = dataclasses.replace(two, opacities=np.full(3, math.log(0.3 / 0.7)))
+    np.testing.assert_allclose(struck(thin, np.array([0.0, 0, 1.0]), down), (0, 0, 0), atol=1e-12)
+    # A long Gaussian along x that is turned to y is met far along y.
+    long = dataclasses.replace(
+        two,
+        scales=np.log(np.array([[0.2, sigma, sigma]] * 3)),
+        quats=np.tile([math.sqrt(0.5), 0, 0, math.sqrt(0.5)], (3, 1)),
+    )
+    assert struck(long, np.array([0.0, 0.1, 1.0]), down) is not None
+    assert struck(long, np.array([0.1, 0.0, 1.0]), down) is None
+
+
+def test_a_click_shows_the_command_that_takes_the_object_out(file):
+    """A ray from above through the ball: the sphere's numbers are those that `inside` takes."""
+    pytest.importorskip("viser")
+    splats, made = read_splats(file), []
+
+    def fill(server):
+        made.append(Choice(server, splats, str(file)))
+        return None
+
+    viewer = serve(fill, port=8790, host="127.0.0.1", block=False)
+    try:
+        found = struck(splats, CENTRE + (0, 0, 1.0), np.array([0.0, 0, -1]))
+        assert found is not None
+        np.testing.assert_allclose(found, CENTRE + (0, 0, RADIUS), atol=0.2 * RADIUS)
+        made[0].choose(CENTRE, 1.3 * RADIUS)
+        words = shlex.split(made[0].command)
+        assert words[:2] == ["dano", "import"] and words[3] == "--sphere"
+        assert splats.inside(sphere=[float(x) for x in words[4:8]]).sum() > 100
+    finally:
+        viewer.stop()
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        view_splats(splats.chosen(np.zeros(len(splats), bool)), file)

@@ -320,8 +320,8 @@ class View:
     Attributes:
         source: A run of `dano simulate` (.npz); a scene file (.toml) or a neural object (.dano), which is
             simulated, and again when a slider of the page moves; a field that `dano build` reads, with a
-            slider for the density of its surface; transforms.json or a folder that holds it, whose cameras
-            are drawn.
+            slider for the density of its surface; Gaussian splats (.ply), out of which a click chooses an
+            object for `dano import`; transforms.json or a folder that holds it, whose cameras are drawn.
         beside: Another run of the same bodies, drawn translucent over the first.
         page: Where to write the page as one file that can be sent to others (.html), instead of serving it.
         port: Port of the page on this computer.

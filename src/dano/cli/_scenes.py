@@ -18,7 +18,7 @@ from dano.cli._arguments import Demo, Simulate, View
 from dano.cli._console import Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures, run_files
 from dano.engine import simulate as simulate_scene
-from dano.fields import FIELD_FORMATS, FIELD_SUFFIXES, load_field
+from dano.fields import FIELD_FORMATS, FIELD_SUFFIXES, is_splats, load_field, read_splats
 from dano.names import did_you_mean
 from dano.objects import NeuralObject
 from dano.scene import Scene, Trajectory
@@ -121,11 +121,12 @@ def view(command: View) -> None:
     kind = _kind(path)
     if command.beside is not None and kind != "run":
         raise ValueError(f"--beside goes with a run, a scene or an object, got it with the {kind} {path}")
-    {"run": _view_run, "field": _view_field, "capture": _view_capture}[kind](command)
+    shown = {"run": _view_run, "field": _view_field, "capture": _view_capture, "splats": _view_splats}
+    shown[kind](command)
 
 
 def _kind(path: Path) -> str:
-    """What is to be shown: a "run" or what is simulated to have one, a "field" or a "capture"."""
+    """What is to be shown: a "run" or what is simulated to have one, a "field", "splats" or a "capture"."""
     if scene_file.is_shipped(path):
         return "run"
     if not path.exists():
@@ -145,7 +146,7 @@ def _kind(path: Path) -> str:
             f" ({', '.join(FIELD_SUFFIXES)}), or photographs with poses (transforms.json or its folder),"
             f" got a {form or suffix or 'nameless'} file"
         )
-    return "field"
+    return "splats" if suffix == ".ply" and is_splats(path) else "field"
 
 
 def _view_run(command: View) -> None:
@@ -187,6 +188,16 @@ def _view_field(command: View) -> None:
         put(f"wrote {command.page}")
         return
     view_field(field, port=command.port)
+
+
+def _view_splats(command: View) -> None:
+    """Gaussian splats, out of which a click chooses an object; as a file the surface of their density."""
+    if command.page is not None:
+        _view_field(command)
+        return
+    from dano.report import view_splats
+
+    view_splats(read_splats(command.source), command.source, port=command.port)
 
 
 def _view_capture(command: View) -> None:

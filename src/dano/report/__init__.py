@@ -43,6 +43,7 @@ from dano.report.viewing import (
     view as view,
     view_capture as view_capture,
     view_field as view_field,
+    view_splats as view_splats,
     Viewer as Viewer,
     write_capture_view as write_capture_view,
     write_field_view as write_field_view,
