@@ -252,7 +252,7 @@ def test_a_click_shows_the_command_that_takes_the_object_out(file):
         assert found is not None
         np.testing.assert_allclose(found, CENTRE + (0, 0, RADIUS), atol=0.2 * RADIUS)
         made[0].choose(CENTRE, 1.3 * RADIUS)
-        words = shlex.split(made[0].command)
+        words = shlex.split(made[0].command.replace("\\\n", ""))
         assert words[:2] == ["dano", "import"] and words[3] == "--sphere"
         assert splats.inside(sphere=[float(x) for x in words[4:8]]).sum() > 100
     finally:
