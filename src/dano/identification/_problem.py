@@ -18,10 +18,11 @@ from dano.identification._residuals import Linearized, linearized, losses, Model
 from dano.identification._result import Identification
 from dano.identification._settings import Setup
 from dano.identification._settling import settled
+from dano.identification._uncertainty import Groups
 from dano.identification._windows import draw_velocities, plan_windows
 from dano.identification.motions import Motion, QUANTITIES
 from dano.scene import Control, Scene, State
-from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
+from dano.solvers import bounded_least_squares, eliminated, NormalEquations, Solution, Stop
 
 # Points whose loss is computed for each start that is refined.
 _LOOKS = 4
@@ -122,6 +123,20 @@ class Problem:
             device_mesh(),
         )
 
+    def check_groups(self, independent: str) -> None:
+        """Refuse fewer independent groups than can tell how far they pull the parameters apart.
+
+        Raises:
+            ValueError: If there are.
+        """
+        count = {"motions": len(set(self.plan.owner.tolist())), "windows": len(self.plan.rows)}
+        least = len(self.space.start) + 2
+        if independent in count and count[independent] < least:
+            raise ValueError(
+                f"options.independent={independent!r} needs at least {least} {independent}, two more than"
+                f" there are parameters, got {count[independent]}"
+            )
+
     def begin_near(self, after: Identification) -> None:
         """Begin where an earlier fit left what it estimated of the windows' states, if this one does too."""
         self._near = True
@@ -189,10 +204,24 @@ class Problem:
 
     def assembled(self, found: Linearized) -> NormalEquations:
         """Normal equations of a simulation of all windows."""
-        loss, gradient, hessian, jump, slope = (np.asarray(v, float) for v in found[:5])
+        return self._assembled(*(np.asarray(v, float) for v in found[:5]), self.plan.owner)
+
+    def groups(self, found: Linearized, independent: str) -> Groups:
+        """What each motion ("motions") or window ("windows") of a simulation says of the parameters."""
+        names = self.plan.owner if independent == "motions" else np.arange(len(self.plan.rows))
+        arrays = [np.asarray(v, float) for v in found[:5]]
+        parts = []
+        for name in range(names[-1] + 1):
+            mine = names == name
+            if mine.any():
+                own = self.plan.owner[mine]
+                parts.append(eliminated(self._assembled(*(v[mine] for v in arrays), own - own[0])))
+        return Groups(np.array([g for g, _ in parts]), np.array([h for _, h in parts]))
+
+    def _assembled(self, loss, gradient, hessian, jump, slope, owner: np.ndarray) -> NormalEquations:
         p, k = len(self.space.start), self.private
         if self.model.jumps is not None:
-            return chained(p, k, self.plan.owner, self.model.jumps, loss, gradient, hessian, jump, slope)
+            return chained(p, k, owner, self.model.jumps, loss, gradient, hessian, jump, slope)
         return NormalEquations(
             float(loss.sum()),
             gradient[:, :p].sum(axis=0),

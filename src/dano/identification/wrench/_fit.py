@@ -1,12 +1,12 @@
 """Mass, centre and inertia of what a wrist holds, by least squares."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 
 from dano.checks import checked_kind
 from dano.identification.wrench._log import Twists, twists, WristLog
+from dano.identification.wrench._shape import about_centre, matrix_of, point_masses, six_of, within_shape
 from dano.maths import checked_numbers, Numbers, quat_conjugate, quat_rotate
 from dano.objects import MassProperties
 
@@ -36,6 +36,9 @@ _UNLIKE = 5.0
 
 _BETTER = 0.7
 """Noise in the other axes, as a share, from which the log is in these."""
+
+_OUTSIDE = 4.0
+"""Standard errors by which a centre of mass may lie outside of a given shape."""
 
 _NAMES = ("mass", "centre", "inertia")
 
@@ -99,7 +102,9 @@ class Load:
         )
 
 
-def identify_load(log: WristLog, *, gravity: Numbers = (0.0, 0.0, -9.81)) -> Load:
+def identify_load(
+    log: WristLog, *, gravity: Numbers = (0.0, 0.0, -9.81), shape: Numbers | None = None
+) -> Load:
     """Mass, centre of mass and inertia of a rigid load from what a wrist's sensor felt while it moved it.
 
     The sensor holds the load at its origin with the force f and the torque τ, in its axes,
@@ -111,21 +116,28 @@ def identify_load(log: WristLog, *, gravity: Numbers = (0.0, 0.0, -9.81)) -> Loa
     sensor exerts or what it feels is seen from the sign of the mass. Inertias that no body can have are moved
     to the likeliest that one can (second moments and mass as the log-Cholesky factor of a 4 × 4 matrix).
 
+    With `shape` the load is one whose mass lies in the convex hull of some points: a sum of masses ≥ 0 at
+    points of the hull, which says far more of a long thin tool than that it is a body (Nadeau, Giamou and
+    Kelly, Fast object inertial parameter identification for collaborative robots, 2022).
+
     Args:
         log: The log.
         gravity: [m/s², W].
+        shape: Points of the load's surface [m, S], shape (n, 3); None: its shape is not known.
 
     Returns:
         Values with standard errors; what the log cannot decide is NaN and named in `unobserved`.
 
     Raises:
-        ValueError: If the log is in world axes, in other units, or the load slips in the gripper.
+        ValueError: If the log is in world axes, in other units, or the load slips in the gripper; if the
+            shape is flat, or does not hold the centre of mass that the log shows.
     """
     checked_kind("log", log, WristLog)
     pull = checked_numbers("gravity", gravity)
     if pull.shape != (3,) or not np.isfinite(pull).all():
         raise ValueError(f"gravity must be three numbers [m/s²], got {gravity}")
     moved = twists(log)
+    bodies = None if shape is None else point_masses(checked_numbers("shape", shape))
     rows = _Rows.of(log, moved, pull)
     fit = _fitted(rows)
     messages: list[str] = []
@@ -143,7 +155,7 @@ def identify_load(log: WristLog, *, gravity: Numbers = (0.0, 0.0, -9.81)) -> Loa
         rows = dataclasses.replace(rows, readings=-rows.readings)
         fit = dataclasses.replace(fit, theta=-fit.theta)
     _check(log, rows, fit)
-    return _load(rows, fit, messages)
+    return _load(rows, fit, messages, bodies)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -294,17 +306,25 @@ def _check_units(rows: _Rows, fit: _Fit) -> None:
         )
 
 
-def _load(rows: _Rows, fit: _Fit, messages: list[str]) -> Load:
+def _load(rows: _Rows, fit: _Fit, messages: list[str], bodies: np.ndarray | None) -> Load:
     """Values, errors, and what is not observed."""
     theta = fit.theta
     covariance = fit.inflation * fit.covariance
-    values, jacobian = _about_centre(theta[:10]), _slopes(theta[:10])
+    values, jacobian = about_centre(theta[:10]), _slopes(theta[:10])
     errors = np.sqrt(np.diagonal(jacobian @ covariance[:10, :10] @ jacobian.T))
+    if bodies is not None and fit.null[:4].max() < 1e-3:
+        _check_within(values, errors, bodies)
+        if fit.null[:10].max() < 1e-3:
+            own = covariance[:10, :10]
+            best, errors = within_shape(theta[:10], own, bodies)
+            follow = covariance[10:, :10] @ np.linalg.solve(own, best - theta[:10])
+            theta = np.concatenate([best, theta[10:] + follow])
+            values = about_centre(best)
     lost = _lost(fit, values, errors)
-    if not any(lost.values()):
+    if not any(lost.values()) and bodies is None:
         theta = _of_a_body(fit, messages)
-        values = _about_centre(theta[:10])
-    mass, centre, inertia = values[0], values[1:4], _matrix(values[4:])
+        values = about_centre(theta[:10])
+    mass, centre, inertia = values[0], values[1:4], matrix_of(values[4:])
     unobserved = tuple(name for name in _NAMES if lost[name])
     if unobserved:
         messages.append(
@@ -313,7 +333,7 @@ def _load(rows: _Rows, fit: _Fit, messages: list[str]) -> Load:
             " the load about three for its inertia"
         )
     found = {"mass": np.asarray(mass), "centre": centre, "inertia": inertia}
-    spread = {"mass": errors[0], "centre": errors[1:4], "inertia": _matrix(errors[4:])}
+    spread = {"mass": errors[0], "centre": errors[1:4], "inertia": matrix_of(errors[4:])}
     for name in unobserved:
         found[name] = np.full_like(found[name], np.nan)
         spread[name] = np.full_like(spread[name], np.inf)
@@ -330,6 +350,22 @@ def _load(rows: _Rows, fit: _Fit, messages: list[str]) -> Load:
         unobserved=unobserved,
         messages=tuple(messages),
     )
+
+
+def _check_within(values: np.ndarray, errors: np.ndarray, bodies: np.ndarray) -> None:
+    """Refuse a shape that does not hold the centre of mass.
+
+    Raises:
+        ValueError: If it does not, by more than chance.
+    """
+    points = bodies[1:4].T
+    off = values[1:4] - np.clip(values[1:4], points.min(axis=0), points.max(axis=0))
+    if np.any(np.abs(off) > _OUTSIDE * errors[1:4] + 1e-3):
+        raise ValueError(
+            "shape must be points of the load in the sensor's frame, in metres: the log shows the centre of"
+            f" mass at {np.round(values[1:4], 4)} m, the points reach from {np.round(points.min(axis=0), 4)}"
+            f" to {np.round(points.max(axis=0), 4)} m"
+        )
 
 
 def _lost(fit: _Fit, values: np.ndarray, errors: np.ndarray) -> dict[str, bool]:
@@ -374,7 +410,7 @@ def _pseudo(theta: np.ndarray) -> np.ndarray:
     Wensing, Kim and Slotine, Linear matrix inequalities for physically consistent inertial parameter
     identification, 2018.
     """
-    inertia = _matrix(theta[4:10])
+    inertia = matrix_of(theta[4:10])
     found = np.zeros((4, 4))
     found[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
     found[:3, 3] = found[3, :3] = theta[1:4]
@@ -389,34 +425,17 @@ def _of_factor(x: np.ndarray) -> np.ndarray:
     factor[np.tril_indices(4, -1)] = x[4:]
     found = factor @ factor.T
     inertia = np.trace(found[:3, :3]) * np.eye(3) - found[:3, :3]
-    return np.concatenate([[found[3, 3]], found[:3, 3], _six(inertia)])
-
-
-def _about_centre(theta: np.ndarray) -> np.ndarray:
-    """Mass, centre and the six numbers of the inertia about it."""
-    mass = theta[0] if abs(theta[0]) > 1e-12 else 1e-12
-    centre = theta[1:4] / mass
-    inertia = _matrix(theta[4:10]) - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    return np.concatenate([[theta[0]], centre, _six(inertia)])
+    return np.concatenate([[found[3, 3]], found[:3, 3], six_of(inertia)])
 
 
 def _slopes(theta: np.ndarray) -> np.ndarray:
-    """Derivatives of `_about_centre`, by central differences."""
+    """Derivatives of `about_centre`, by central differences."""
     found = np.empty((10, 10))
     for k in range(10):
         step = np.zeros(10)
         step[k] = 1e-6 * max(abs(theta[k]), 1e-6)
-        found[:, k] = (_about_centre(theta + step) - _about_centre(theta - step)) / (2 * step[k])
+        found[:, k] = (about_centre(theta + step) - about_centre(theta - step)) / (2 * step[k])
     return found
-
-
-def _matrix(six: Sequence[float] | np.ndarray) -> np.ndarray:
-    xx, yy, zz, xy, xz, yz = six
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-def _six(matrix: np.ndarray) -> np.ndarray:
-    return matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
 def _inertial(vectors: np.ndarray) -> np.ndarray:
