@@ -125,7 +125,7 @@ def _from_parts(tools: list[Tool]) -> list[Row]:
     table = np.array(off)
     for k, (name, unit, target) in enumerate(names):
         low, middle, high = np.quantile(table[:, k], (0.25, 0.5, 0.75))
-        note = f"worst {table[:, k].max():.2g}; {len(table)} of {len(tools)} tools, of the materials that they list"
+        note = f"worst {table[:, k].max():.2g}; {len(table)} of {len(tools)} tools"
         found.append(
             Row(group, f"{name}, median error", middle, unit, target, quartiles=(low, high), note=note)
         )

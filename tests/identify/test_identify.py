@@ -185,6 +185,11 @@ def test_motions_whose_friction_differs_say_how_sure_a_friction_is():
     assert alone.standard_errors["mu"] < 0.5 * expected
     low, high = fit.interval("mu")
     assert low < 0.25 < high
+    # Five recordings of two slides each: the mean of a pair scatters by less, and there are fewer of them.
+    pairs = dano.IdentifyOptions(independent=[str(k // 2) for k in range(10)])
+    fit = dano.identify(ball_scene(), slides, [FRICTION], noise=NOISE, initial="given", options=pairs)
+    expected = np.std(frictions.reshape(5, 2).mean(axis=1), ddof=1) / np.sqrt(5)
+    assert fit.freedom == 4 and fit.standard_errors["mu"] == pytest.approx(expected, rel=0.4)
 
 
 def test_outliers_pull_less_with_hubers_loss(observed):
@@ -342,6 +347,45 @@ def test_an_impact_soon_after_the_first_frame():
     assert abs(start.omega[0, 0, 2]) > 1.0
     np.testing.assert_allclose(narrow.omega[0, 0], 0, atol=1e-6)
     np.testing.assert_allclose(narrow.velocity[0, 0], run.states.velocity[0, 0], atol=0.2)
+
+
+def test_a_first_velocity_is_not_moved_across_an_impact():
+    """Half a step before its frame the ball still falls: the bounce after it says nothing of that."""
+    scene = ball_scene()
+
+    def begun(speeds, **options):
+        speeds = np.array(speeds, float)
+        heights = RADIUS + 0.02 + np.cumsum(np.append(0.0, speeds[:-1] * H))
+        motion = dano.Motion.create(
+            H * np.arange(len(speeds)),
+            "ball",
+            position=np.column_stack([0 * speeds, 0 * speeds, heights]),
+            orientation=np.tile([1.0, 0, 0, 0], (len(speeds), 1)),
+            velocity=np.column_stack([0 * speeds, 0 * speeds, speeds]),
+            omega=np.zeros((len(speeds), 3)),
+            **options,
+        )
+        plan = plan_windows(
+            scene,
+            [motion],
+            states=[None],
+            controls=[None],
+            noise=NOISE,
+            initial=(),
+            window=2,
+            continuous=False,
+        )
+        return np.asarray(plan.start.velocity[:, 0, 2])
+
+    fall = -9.81 * H
+    np.testing.assert_allclose(begun([-1.0, -1.0 + fall])[0], -1.0 - fall / 2)
+    with pytest.warns(UserWarning, match="velocity of 'ball' changes .* as by an impact, in the motion"):
+        np.testing.assert_allclose(begun([-1.0, 0.8]), [-1.0])
+    # Velocities that are known where the simulation has them need no move.
+    np.testing.assert_allclose(begun([-1.0, 0.8], lag=H / 2), [-1.0])
+    # The bounce is after the third frame, with which the second window begins: before it, it fell.
+    third = [-1.0, -1.0 + fall, -1.0 + 2 * fall, 0.9]
+    np.testing.assert_allclose(begun(third)[1], third[2] - fall / 2)
 
 
 def test_velocities_are_compared_at_their_own_times():
@@ -597,9 +641,11 @@ def test_bad_input():
     nobody = dataclasses.replace(sliding_motion(), names=("cube",))
     refuse("bodies of the scene", observed=nobody)
     refuse(
-        "options.independent='motions' needs at least 3 motions, two more than there are parameters, got 1",
+        "options.independent needs at least 3 motions, two more than there are parameters, got 1",
         options=dano.IdentifyOptions(independent="motions"),
     )
+    labelled = dano.IdentifyOptions(independent=["a", "b"])
+    refuse("must be one label for each of 1 motions, got 2", options=labelled)
     only_turns = dataclasses.replace(sliding_motion(), position=np.full((10, 1, 3), np.nan))
     refuse("must have a frame with positions", observed=only_turns)
     only_floor = dataclasses.replace(sliding_motion(), names=("floor",))

@@ -123,19 +123,32 @@ class Problem:
             device_mesh(),
         )
 
-    def check_groups(self, independent: str) -> None:
+    def check_groups(self, independent: str | Sequence[str]) -> None:
         """Refuse fewer independent groups than can tell how far they pull the parameters apart.
 
         Raises:
-            ValueError: If there are.
+            ValueError: If there are, or labels are not one for each motion.
         """
-        count = {"motions": len(set(self.plan.owner.tolist())), "windows": len(self.plan.rows)}
-        least = len(self.space.start) + 2
-        if independent in count and count[independent] < least:
+        if independent == "numbers":
+            return
+        motions = int(self.plan.owner[-1]) + 1
+        if not isinstance(independent, str) and len(independent) != motions:
             raise ValueError(
-                f"options.independent={independent!r} needs at least {least} {independent}, two more than"
-                f" there are parameters, got {count[independent]}"
+                f"options.independent must be one label for each of {motions} motions, got {len(independent)}"
             )
+        count, least = len(np.unique(self._labels(independent))), len(self.space.start) + 2
+        if count < least:
+            what = independent if isinstance(independent, str) else "labels"
+            raise ValueError(
+                f"options.independent needs at least {least} {what}, two more than there are parameters, got"
+                f" {count}"
+            )
+
+    def _labels(self, independent: str | Sequence[str]) -> np.ndarray:
+        """Of each window, what it shares errors with."""
+        if independent == "windows":
+            return np.arange(len(self.plan.rows))
+        return self.plan.owner if independent == "motions" else np.array(independent)[self.plan.owner]
 
     def begin_near(self, after: Identification) -> None:
         """Begin where an earlier fit left what it estimated of the windows' states, if this one does too."""
@@ -206,16 +219,15 @@ class Problem:
         """Normal equations of a simulation of all windows."""
         return self._assembled(*(np.asarray(v, float) for v in found[:5]), self.plan.owner)
 
-    def groups(self, found: Linearized, independent: str) -> Groups:
-        """What each motion ("motions") or window ("windows") of a simulation says of the parameters."""
-        names = self.plan.owner if independent == "motions" else np.arange(len(self.plan.rows))
+    def groups(self, found: Linearized, independent: str | Sequence[str]) -> Groups:
+        """What each independent group of a simulation says of the parameters; see `IdentifyOptions`."""
+        labels = self._labels(independent)
         arrays = [np.asarray(v, float) for v in found[:5]]
         parts = []
-        for name in range(names[-1] + 1):
-            mine = names == name
-            if mine.any():
-                own = self.plan.owner[mine]
-                parts.append(eliminated(self._assembled(*(v[mine] for v in arrays), own - own[0])))
+        for label in np.unique(labels):
+            mine = labels == label
+            _, owner = np.unique(self.plan.owner[mine], return_inverse=True)
+            parts.append(eliminated(self._assembled(*(v[mine] for v in arrays), owner)))
         return Groups(np.array([g for g, _ in parts]), np.array([h for _, h in parts]))
 
     def _assembled(self, loss, gradient, hessian, jump, slope, owner: np.ndarray) -> NormalEquations:

@@ -44,9 +44,10 @@ class IdentifyOptions:
             with one after the other. Needs `window`, and all of the initial states to be estimated
             (`initial="states"`). None: any gap.
         huber: Length of a residual, in standard deviations, from which it counts linearly; None: never.
-        independent: Between what errors are independent: "numbers" (all that were observed), or "windows" or
-            "motions". Within these they may then be anything, such as those of a law that is a little
-            wrong, and standard errors come from how far these pull the parameters apart.
+        independent: Between what errors are independent: "numbers" (all that were observed), "windows" or
+            "motions", or a label for each motion: those of one label share errors, as pieces of one recording
+            do. Within these they may then be anything, such as those of a law that is a little wrong, and
+            standard errors come from how far these pull the parameters apart.
         smooth: Whether to go on by slopes over visible steps where the loss is rough: to the minimum of its
             trend, with standard errors that hold the ripples.
         starts: Points to start from: the scene's values, and others in the bounds. None: one, of one or two
@@ -63,7 +64,7 @@ class IdentifyOptions:
     window: int | None = None
     continuity: float | Sequence[float] | None = None
     huber: float | None = None
-    independent: str = "numbers"
+    independent: str | Sequence[str] = "numbers"
     smooth: bool = True
     starts: int | None = None
     seed: int = 0
@@ -86,7 +87,10 @@ class IdentifyOptions:
             raise ValueError(f"continuity needs window, got continuity {self.continuity} and window None")
         if self.huber is not None:
             checked_number("huber", self.huber, above=0)
-        checked_choice("independent", self.independent, INDEPENDENT)
+        if isinstance(self.independent, str):
+            checked_choice("independent", self.independent, INDEPENDENT)
+        else:
+            checked_items("independent", self.independent, str)
         if self.independent == "windows" and self.gaps:
             raise ValueError(
                 "independent='windows' excludes continuity: windows that must meet are one motion"
