@@ -11,7 +11,6 @@ What belongs to the measurement is fitted once, for both: the pusher's radius, a
 its coordinates beside those of the camera (they differ by half a per cent).
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import t as student
 
 import dano
 from benchmarks._measure import Row, skipped
@@ -145,7 +143,7 @@ def rows(source: Source | None, *, quick: bool = False) -> list[Row]:
     for key, value in measuring.items():
         unit = "" if key == "scale" else "mm"
         found.append(Row("Pushes: the measurement", key, value if key == "scale" else 1e3 * value, unit))
-    return found + _frictions([*fitted, *held], measuring, ours, quick)
+    return found
 
 
 def ends(pushes: Sequence[Push], poses: Sequence[np.ndarray]) -> np.ndarray:
@@ -328,122 +326,6 @@ def _fitted(pushes: Sequence[Push], measuring: Mapping[str, float], tries: int) 
         return _misfit(ends(parts, simulated(parts, measuring, values)))
 
     return _least(misfit, {"friction": 0.22, "feet": 0.050}, {"friction": 0.06, "feet": 0.006}, tries)
-
-
-# --- frictions with intervals -------------------------------------------------------------------------------
-
-
-def _frictions(pushes: Sequence[Push], measuring, values, quick: bool) -> list[Row]:
-    """The pusher's friction in each recording by `dano.identify`, and whether intervals hold between them."""
-    group = "Pushes: friction of the pusher, of each recording"
-    found: list[Row] = []
-    fits: dict[str, list[dano.Identification]] = {kind: [] for kind in INDEPENDENT}
-    for push in pushes[: 2 if quick else None]:
-        fit = None
-        for kind, each in fits.items():
-            fit = identify(push, measuring, values, independent=kind, after=fit)
-            each.append(fit)
-        low, high = fit.interval("pusher")
-        note = f"95 % {low:.3f} to {high:.3f}; {len(fit.motions)} pieces of {PIECE * FRAME:g} s"
-        found.append(Row(group, push.name, float(fit.values["pusher"]), "", note=note))
-    group = "Pushes: 95 % intervals that hold the friction of other recordings"
-    for kind, each in fits.items():
-        held, note = agreement(each)
-        words = "every frame independent" if kind == "numbers" else "pieces independent"
-        found.append(Row(group, words, held, "%", note=note))
-    each = np.array([fit.values["pusher"] for fit in fits["motions"]])
-    held, note = predicted(each)
-    found.append(Row(group, "recordings independent", held, "%", 90.0, True, note=note))
-    return found
-
-
-INDEPENDENT = ("numbers", "motions")
-PIECE = 125  # frames
-MOST_PIECES = 15
-
-
-def agreement(fits: Sequence[dano.Identification]) -> tuple[float, str]:
-    """Share [%] of recordings whose 95 % interval holds what the others say, and words.
-
-    What the others say is their mean with weights of the inverse variances; its own error is counted.
-    """
-    values = np.array([float(fit.values["pusher"]) for fit in fits])
-    sigmas = np.array([float(fit.standard_errors["pusher"]) for fit in fits])
-    weights = 1 / sigmas**2
-    inside = []
-    for k, fit in enumerate(fits):
-        others = np.delete(weights, k)
-        middle = others @ np.delete(values, k) / others.sum()
-        low, high = fit.interval("pusher")
-        half = np.hypot(0.5 * (high - low), 1.96 / np.sqrt(others.sum()))
-        inside.append(abs(values[k] - middle) <= half)
-    scatter = f"scatter between recordings {np.std(values, ddof=1):.3f}, stated {np.median(sigmas):.3f}"
-    return 100 * float(np.mean(inside)), f"{sum(inside)} of {len(inside)}; {scatter}"
-
-
-def predicted(values: np.ndarray) -> tuple[float, str]:
-    """Share [%] of recordings in the 95 % interval that the others predict for one more, and words.
-
-    Mean ± t s √(1 + 1/m) of m others, with their standard deviation s and Student's t of m − 1.
-    """
-    inside = []
-    for k, value in enumerate(values):
-        others = np.delete(values, k)
-        half = float(student.ppf(0.975, len(others) - 1)) * np.std(others, ddof=1)
-        inside.append(abs(value - others.mean()) <= half * np.sqrt(1 + 1 / len(others)))
-    half = float(student.ppf(0.975, len(values) - 1)) * np.std(values, ddof=1) * np.sqrt(1 + 1 / len(values))
-    note = f"{sum(inside)} of {len(inside)}; for one more: {values.mean():.3f} ± {half:.3f}"
-    return 100 * float(np.mean(inside)), note
-
-
-def identify(
-    push: Push,
-    measuring: Mapping[str, float],
-    values: Mapping[str, float],
-    *,
-    independent: str = "motions",
-    after: dano.Identification | None = None,
-) -> dano.Identification:
-    """Friction of the pusher from one recording, in pieces of half a second.
-
-    Each piece is a motion that begins where the block was and as fast: a blow spoils only its own. The
-    friction of the table does not show: the block stops as soon as it is not pushed.
-    """
-    made = scene(measuring["radius"], **values)
-    count = min(len(push) // PIECE, MOST_PIECES)
-    pieces = [
-        Push(push.name, push.block[k * PIECE : (k + 1) * PIECE], push.pusher[k * PIECE : (k + 1) * PIECE])
-        for k in range(count)
-    ]
-    paths = [piece.path(measuring) for piece in pieces]
-    friction = dano.Parameter("pusher", lambda s: s.contact("pusher", "block").sliding_friction, 0.02, 1.0)
-    options = dano.IdentifyOptions(huber=1.5, independent=independent, starts=1, smooth=False)
-    with warnings.catch_warnings():
-        # That residuals of a piece hang together.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return dano.identify(
-            made,
-            [_motion(piece) for piece in pieces],
-            [friction],
-            state=[start(made, piece, path, moving=True) for piece, path in zip(pieces, paths, strict=True)],
-            controls=[driven(made, path[1:]) for path in paths],
-            initial="given",
-            noise={"position": 1e-3, "orientation": 5e-3},
-            after=after,
-            options=options,
-        )
-
-
-def _motion(push: Push) -> dano.Motion:
-    frames = np.arange(0, len(push), 31)
-    x, y, angle = push.block[frames].T
-    still = np.zeros_like(x)
-    return dano.Motion.create(
-        frames * FRAME,
-        "block",
-        position=np.column_stack([x, y, still + FOOT + HEIGHT]),
-        orientation=np.column_stack([np.cos(angle / 2), still, still, np.sin(angle / 2)]),
-    )
 
 
 def picture(source: Source, folder: Path) -> Path:
