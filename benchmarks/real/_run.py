@@ -16,7 +16,12 @@ PARTS = {
     "tools": _tools,
 }
 
-PICTURES = {name: part.picture for name, part in PARTS.items() if part is not _frictions}
+PICTURES = {
+    "impacts": _impacts.picture,
+    "squares": _squares.picture,
+    "pushes": _pushes.picture,
+    "tools": _tools.picture,
+}
 
 
 def run() -> None:

@@ -159,11 +159,11 @@ def _misfit(off: np.ndarray) -> float:
 
 
 def scene(
-    timestep: float, friction: float, restitution: float, hysteresis: float, gyration: float
+    timestep: float, friction: float, restitution: float, hysteresis: float, gyration: float, rounding: float
 ) -> dano.Scene:
     """The square between its panes: a planar joint about −y, whose angle turns x into z."""
     inertia = MASS * gyration**2 * np.eye(3)
-    square = dano.Body("square", dano.Box((HALF,) * 3), mass=MASS, inertia=inertia)
+    square = dano.Body("square", dano.Box((HALF,) * 3, rounding), mass=MASS, inertia=inertia)
     floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
     panes = dano.Joint(None, "square", "planar", axis=(0, -1, 0))
     params = dano.ContactParams(
@@ -201,11 +201,20 @@ def simulated(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
 
 
 def of_mujoco(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
-    """Poses at `MOMENTS` by MuJoCo, with its friction and direct `solref`."""
+    """Poses at `MOMENTS` by MuJoCo, with its friction and direct `solref`.
+
+    Spheres are its corners: in a plane, and on a floor, nothing else of the square touches.
+    """
     import mujoco
     from mujoco import rollout
 
-    inertia = MASS * values["gyration"] ** 2
+    inertia, radius = MASS * values["gyration"] ** 2, values["rounding"]
+    reach = HALF - radius
+    corners = "".join(
+        f'<geom type="sphere" pos="{x} 0 {z}" size="{radius}"/>'
+        for x in (-reach, reach)
+        for z in (-reach, reach)
+    )
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><option timestep="{FRAME / MUJOCO_STEPS}" gravity="0 0 {-GRAVITY}" cone="elliptic"/>'
         f'<default><geom condim="3" friction="{values["friction"]} 0 0" '
@@ -214,8 +223,7 @@ def of_mujoco(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
         '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint type="hinge" axis="0'
         ' -1 0"/>'
         f'<inertial mass="{MASS}" pos="0 0 0" diaginertia="{inertia} {inertia} {inertia}"/>'
-        f'<geom type="box" size="{HALF} {HALF} {HALF}"/>'
-        "</body></worldbody></mujoco>"
+        f"{corners}</body></worldbody></mujoco>"
     )
     data = mujoco.MjData(model)
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -232,13 +240,13 @@ MUJOCO_STEPS = 4
 SIMULATORS: dict[str, tuple[Simulator, dict[str, float], dict[str, float]]] = {
     "dano": (
         simulated,
-        {"friction": 0.15, "restitution": 0.4, "hysteresis": 0.35, "gyration": 0.021},
-        {"friction": 0.3, "restitution": 0.2, "hysteresis": 0.5, "gyration": 0.05},
+        {"friction": 0.12, "restitution": 0.43, "hysteresis": 0.5, "gyration": 0.022, "rounding": 0.0015},
+        {"friction": 0.3, "restitution": 0.2, "hysteresis": 0.5, "gyration": 0.05, "rounding": 0.5},
     ),
     "MuJoCo": (
         of_mujoco,
-        {"friction": 0.15, "stiffness": 5e4, "damping": 100.0, "gyration": 0.021},
-        {"friction": 0.3, "stiffness": 0.7, "damping": 0.5, "gyration": 0.05},
+        {"friction": 0.12, "stiffness": 7e4, "damping": 150.0, "gyration": 0.022, "rounding": 0.0015},
+        {"friction": 0.3, "stiffness": 0.7, "damping": 0.5, "gyration": 0.05, "rounding": 0.5},
     ),
 }
 
