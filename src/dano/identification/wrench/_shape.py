@@ -1,4 +1,4 @@
-"""Mass properties as ten numbers: of a body of points, and of one whose mass lies within a given shape.
+"""Mass properties as ten numbers: those that a body can have, and those of one within a given shape.
 
 The ten numbers are the mass, the first moments and the inertia about the origin (xx, yy, zz, xy, xz, yz).
 They are linear in where mass is, so bodies within a shape are a convex cone.
@@ -71,6 +71,54 @@ def within_shape(
     drawn = np.random.default_rng(0).standard_normal((_DRAWS, 10)) @ root.T * scale
     off = np.array([about_centre(likeliest(best + each)) for each in drawn]) - about_centre(best)
     return best, np.sqrt(np.mean(off**2, axis=0))
+
+
+def of_a_body(theta: np.ndarray, covariance: np.ndarray) -> np.ndarray | None:
+    """The likeliest ten numbers that a body can have; None if `theta` are those of one.
+
+    Args:
+        theta: Least squares estimate of the ten numbers.
+        covariance: Its covariance, shape (10, 10).
+    """
+    if np.linalg.eigvalsh(_pseudo(theta)).min() > 0:
+        return None
+    from scipy.optimize import least_squares
+
+    scale = np.sqrt(np.diagonal(covariance))
+    root = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-12 * np.eye(10))
+
+    def off(x: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(root, (_of_factor(x) - theta) / scale)
+
+    values, vectors = np.linalg.eigh(_pseudo(theta))
+    near = (vectors * np.maximum(values, 1e-6 * values.max())) @ vectors.T
+    factor = np.linalg.cholesky(near)
+    start = np.concatenate([np.log(np.diagonal(factor)), factor[np.tril_indices(4, -1)]])
+    return _of_factor(least_squares(off, start, x_scale="jac").x)
+
+
+def _pseudo(theta: np.ndarray) -> np.ndarray:
+    """Second moments, first moments and mass as one matrix: positive definite for every body, and only these.
+
+    Wensing, Kim and Slotine, Linear matrix inequalities for physically consistent inertial parameter
+    identification, 2018.
+    """
+    inertia = matrix_of(theta[4:10])
+    found = np.zeros((4, 4))
+    found[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    found[:3, 3] = found[3, :3] = theta[1:4]
+    found[3, 3] = theta[0]
+    return found
+
+
+def _of_factor(x: np.ndarray) -> np.ndarray:
+    """Mass, first moments and inertia about the origin from the logarithmic Cholesky factor of `_pseudo`."""
+    factor = np.zeros((4, 4))
+    factor[np.diag_indices(4)] = np.exp(np.clip(x[:4], -40, 20))
+    factor[np.tril_indices(4, -1)] = x[4:]
+    found = factor @ factor.T
+    inertia = np.trace(found[:3, :3]) * np.eye(3) - found[:3, :3]
+    return np.concatenate([[found[3, 3]], found[:3, 3], six_of(inertia)])
 
 
 def about_centre(theta: np.ndarray) -> np.ndarray:
