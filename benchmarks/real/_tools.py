@@ -89,9 +89,9 @@ class Tool:
         names = ("MASS", "COM_WRT_MESH", "INERTIA_WRT_COM", "GRASP_WRT_MESH")
         if missing := [name for name in names if name not in found]:
             raise ValueError(f"{folder}/Inertia.yaml must hold {list(names)}, it lacks {missing}")
-        values = [np.array(ast.literal_eval(found[name]), float) for name in names]
+        mass, com, inertia, grasp = (np.array(ast.literal_eval(found[name]), float) for name in names)
         sheet = (folder / "Materials.txt").read_text().lower()
-        return cls(folder.name, folder / "mesh.ply", float(values[0]), *values[1:], sheet)
+        return cls(folder.name, folder / "mesh.ply", float(mass), com, inertia, grasp, sheet)
 
 
 def rows(source: Source | None, *, quick: bool = False) -> list[Row]:

@@ -217,7 +217,7 @@ class Problem:
 
     def assembled(self, found: Linearized) -> NormalEquations:
         """Normal equations of a simulation of all windows."""
-        return self._assembled(*(np.asarray(v, float) for v in found[:5]), self.plan.owner)
+        return self._assembled(*(np.asarray(v, float) for v in found[:5]), owner=self.plan.owner)
 
     def groups(self, found: Linearized, independent: str | Sequence[str]) -> Groups:
         """What each independent group of a simulation says of the parameters; see `IdentifyOptions`."""
@@ -227,10 +227,10 @@ class Problem:
         for label in np.unique(labels):
             mine = labels == label
             _, owner = np.unique(self.plan.owner[mine], return_inverse=True)
-            parts.append(eliminated(self._assembled(*(v[mine] for v in arrays), owner)))
+            parts.append(eliminated(self._assembled(*(v[mine] for v in arrays), owner=owner)))
         return Groups(np.array([g for g, _ in parts]), np.array([h for _, h in parts]))
 
-    def _assembled(self, loss, gradient, hessian, jump, slope, owner: np.ndarray) -> NormalEquations:
+    def _assembled(self, loss, gradient, hessian, jump, slope, *, owner: np.ndarray) -> NormalEquations:
         p, k = len(self.space.start), self.private
         if self.model.jumps is not None:
             return chained(p, k, owner, self.model.jumps, loss, gradient, hessian, jump, slope)

@@ -146,7 +146,7 @@ class _Moved:
 
 
 def _moved(log: JointLog, scene: Scene, index: int) -> _Moved:
-    known = np.isfinite(np.concatenate([log.q, log.torque], axis=1)).all(axis=1)
+    known = np.atleast_1d(np.isfinite(np.concatenate([log.q, log.torque], axis=1)).all(axis=1))
     around = surroundings(log.times, known)
     along = around.inverse @ log.q[around.near]
     v, gained = along[:, 1] / around.scale, 2 * along[:, 2] / around.scale**2

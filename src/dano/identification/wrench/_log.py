@@ -179,7 +179,7 @@ def twists(log: WristLog) -> Twists:
         ValueError: If too few rows have poses, or accelerations are those of other units.
     """
     given = np.column_stack([log.position, log.orientation, log.force, log.torque])
-    middle, near, inverse, scale = surroundings(log.times, np.isfinite(given).all(axis=1))
+    middle, near, inverse, scale = surroundings(log.times, np.atleast_1d(np.isfinite(given).all(axis=1)))
     turns = log.orientation[middle]
     relative = quat_multiply(quat_conjugate(turns)[:, None], log.orientation[near])
     vectors = np.asarray(quat_log(relative))
