@@ -142,6 +142,8 @@ def built(tool: Tool) -> tuple[dano.NeuralObject, dano.objects.MassProperties]:
     Raises:
         ValueError: If its parts are not told apart, or see `dano.build_parts`.
     """
+    import trimesh
+
     pieces = _pieces(tool)
     chosen = densities(tool, pieces)
     options = BuildOptions(samples=300, resolution=48, units="mm", up="z")
@@ -149,9 +151,11 @@ def built(tool: Tool) -> tuple[dano.NeuralObject, dano.objects.MassProperties]:
         # That the files state no unit, and what of them was mended.
         warnings.simplefilter("ignore")
         parts = []
-        for k, (piece, density) in enumerate(zip(pieces, chosen, strict=True)):
-            path = Path(folder) / f"part{k}.ply"
-            piece.export(path)
+        for density in sorted(set(chosen)):
+            # Pieces of one material are one part: some lie in each other, and a mesh counts them once.
+            mine = [piece for piece, each in zip(pieces, chosen, strict=True) if each == density]
+            path = Path(folder) / f"material{density:g}.ply"
+            trimesh.util.concatenate(mine).export(path)
             parts.append(dano.Part(path, density=density))
         made = dano.build_parts(parts, options)
     volumes = [abs(piece.volume) for piece in pieces]

@@ -402,7 +402,7 @@ def _earlier(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Velocities half a step before a frame, which is where the rollout has them, from the frames around.
 
-    A slope over an impact is none: then that of the frames on the side to which the velocity is moved counts.
+    A slope over an impact does not count; that of the frames on the side to which the velocity is moved does.
     And where these have one between them, or are not there, the velocity stays that of its frame: the second
     array, shape (n,), says of which bodies.
     """
