@@ -102,7 +102,7 @@ def rows(source: Source | None, *, quick: bool = False) -> list[Row]:
     fitted, held = drops(source)
     found, off = [], {}
     for name, (simulate, start, steps) in SIMULATORS.items():
-        values, tries = tuned(simulate, fitted, start, steps, tries=20 if quick else 60)
+        values, tries = tuned(simulate, fitted, start, steps, tries=20 if quick else 160)
         off[name] = errors(simulate(held.starts, values), held)
         note = ", ".join(f"{key} {value:.3g}" for key, value in values.items())
         found += _rows(f"Drops of a square: {name}", off[name], f"{note}; {tries} tries; {source.words}")
@@ -159,11 +159,11 @@ def _misfit(off: np.ndarray) -> float:
 
 
 def scene(
-    timestep: float, friction: float, restitution: float, hysteresis: float, gyration: float, rounding: float
+    timestep: float, friction: float, restitution: float, hysteresis: float, gyration: float
 ) -> dano.Scene:
     """The square between its panes: a planar joint about −y, whose angle turns x into z."""
     inertia = MASS * gyration**2 * np.eye(3)
-    square = dano.Body("square", dano.Box((HALF,) * 3, rounding), mass=MASS, inertia=inertia)
+    square = dano.Body("square", dano.Box((HALF,) * 3), mass=MASS, inertia=inertia)
     floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
     panes = dano.Joint(None, "square", "planar", axis=(0, -1, 0))
     params = dano.ContactParams(
@@ -201,20 +201,11 @@ def simulated(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
 
 
 def of_mujoco(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
-    """Poses at `MOMENTS` by MuJoCo, with its friction and direct `solref`.
-
-    Spheres are its corners: in a plane, and on a floor, nothing else of the square touches.
-    """
+    """Poses at `MOMENTS` by MuJoCo, with its friction and direct `solref`."""
     import mujoco
     from mujoco import rollout
 
-    inertia, radius = MASS * values["gyration"] ** 2, values["rounding"]
-    reach = HALF - radius
-    corners = "".join(
-        f'<geom type="sphere" pos="{x} 0 {z}" size="{radius}"/>'
-        for x in (-reach, reach)
-        for z in (-reach, reach)
-    )
+    inertia = MASS * values["gyration"] ** 2
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><option timestep="{FRAME / MUJOCO_STEPS}" gravity="0 0 {-GRAVITY}" cone="elliptic"/>'
         f'<default><geom condim="3" friction="{values["friction"]} 0 0" '
@@ -223,7 +214,8 @@ def of_mujoco(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
         '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint type="hinge" axis="0'
         ' -1 0"/>'
         f'<inertial mass="{MASS}" pos="0 0 0" diaginertia="{inertia} {inertia} {inertia}"/>'
-        f"{corners}</body></worldbody></mujoco>"
+        f'<geom type="box" size="{HALF} {HALF} {HALF}"/>'
+        "</body></worldbody></mujoco>"
     )
     data = mujoco.MjData(model)
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -237,17 +229,16 @@ def of_mujoco(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
 MUJOCO_STEPS = 4
 """Steps a frame: its impacts are springs, and a millisecond resolves them."""
 
-# Both begin where wider searches on the same half ended, of a hundred tries each.
 SIMULATORS: dict[str, tuple[Simulator, dict[str, float], dict[str, float]]] = {
     "dano": (
         simulated,
-        {"friction": 0.11, "restitution": 0.39, "hysteresis": 0.9, "gyration": 0.0205, "rounding": 0.0018},
-        {"friction": 0.15, "restitution": 0.1, "hysteresis": 0.2, "gyration": 0.03, "rounding": 0.3},
+        {"friction": 0.15, "restitution": 0.4, "hysteresis": 0.35, "gyration": 0.021},
+        {"friction": 0.3, "restitution": 0.2, "hysteresis": 0.5, "gyration": 0.05},
     ),
     "MuJoCo": (
         of_mujoco,
-        {"friction": 0.11, "stiffness": 7e4, "damping": 165.0, "gyration": 0.0225, "rounding": 0.0025},
-        {"friction": 0.15, "stiffness": 0.4, "damping": 0.3, "gyration": 0.03, "rounding": 0.3},
+        {"friction": 0.15, "stiffness": 5e4, "damping": 100.0, "gyration": 0.021},
+        {"friction": 0.3, "stiffness": 0.7, "damping": 0.5, "gyration": 0.05},
     ),
 }
 
