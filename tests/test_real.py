@@ -1,5 +1,7 @@
 """Real recordings: readers refuse what is broken, and a few rows are predicted as the stored results say."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -83,7 +85,7 @@ def test_materials_are_found_from_the_weight():
     empty = np.zeros(3), np.eye(3), np.eye(4)
 
     def found(weight, sheet="handle: oak\nhead: cast carbon steel\npin: brass"):
-        return _tools.densities(_tools.Tool("tool", None, weight, *empty, sheet), pieces)
+        return _tools.densities(_tools.Tool("tool", Path("tool.ply"), weight, *empty, sheet), pieces)
 
     assert found(mass) == truth
     with pytest.raises(ValueError, match=r"no choice of \[560.0, 7800.0, 8500.0\] kg/m³ for 3 parts"):
