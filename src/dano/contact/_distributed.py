@@ -27,8 +27,8 @@ CHUNK = 16
 SINKING = 0.005
 IMPACT_DEPTH = 0.005
 """Depth of an impact over the size of the smaller body, at default."""
-# Where edges and faces meet a plane: share by which a body sinks, and least depth of an impact over that of
-# others. A face that closes over a cushion lands row by row: many small impacts lose less than one.
+# Where edges and faces of both bodies are known: share by which a body sinks, and least depth of an impact
+# over that of others. A face that closes over a cushion lands row by row: many small impacts lose less.
 _SHARP_SINKING, _SHARP_DEPTH = 1e-4, 2e-3
 # Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
 _SLOW = 0.2
@@ -188,7 +188,7 @@ def _slow(gravity: Float[Q, ""], size: Any) -> Float[AnyArray, ""]:
 
 @by_numpy
 def _sharp_depth(gravity: Float[Q, ""], timestep: Float[Q, ""], depth: Float[Q, ""]) -> Float[AnyArray, ""]:
-    """Depth of an impact [m] where edges and faces meet a plane, from that of others.
+    """Depth of an impact [m] where edges and faces of both bodies are known, from that of others.
 
     A body that is held is taken to fall until it meets others, within a step by g h²: that is no impact.
     """
