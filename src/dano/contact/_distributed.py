@@ -76,11 +76,10 @@ class DistributedLaw(AbstractContactLaw):
     A sample of area A at depth d below the other body's surface, with outward normal n there, separating at
     v_n and slipping at u, feels
 
-        F = A p (n − μ(p) c(u/v_s)),   p = k max(0, d − D),
-        D = d ((ρ − σ) s(v_n/v_e) + σ c(v_n/v_s))  or  θ h v_n,  whichever is larger,
+        F = A p (n − μ(p) c(u/v_s)),   p = k max(0, d − θ h v_n) (1 − (1 − σ) x − σ c(v_n/v_s))
 
-    with ρ = 1 and s(x) = x up to its limits ±1 (with `compliant`: ρ = (1 − e²)/(1 + e²), s(x) = x/√(1 + x²)),
-    c(x) = x/max(|x|, 1), v_e not below √(g d)/5, and μ(p) = μ (1 − φ p/(p + p₀)); A is the part of the
+    with x = v_n/v_e up to its limits ±1, c(x) = x/max(|x|, 1), v_e not below √(g d)/5, and
+    μ(p) = μ (1 − φ p/(p + p₀)) (with `compliant` p is another); A is the part of the
     sample's area that faces the other body (see `ContactParams` for the parameters). Velocities are those at
     the end of the step.
     Torsional and rolling resistance come out of the geometry. Where both bodies have samples, each set
@@ -93,8 +92,8 @@ class DistributedLaw(AbstractContactLaw):
 
     Default stiffness: set down on a rigid floor in a typical (the median) orientation, so on a corner, an
     edge or a bulge, under the weight of the heaviest body of the scene, a body sinks by 0.5 % of its size; on
-    a flat side by much less; where edges and faces meet a plane, by 0.01 %. Default restitution velocity:
-    √(g · 0.5 % size)/5, small against impacts, large against what is left of motion at rest.
+    a flat side by much less; where edges and faces of both are known, by 0.01 %. Default restitution
+    velocity: √(g · 0.5 % size)/5, small against impacts, large against what is left of motion at rest.
 
     Attributes:
         stiction_velocity: v_s, slip up to which friction counts as sticking [m/s].
