@@ -171,6 +171,47 @@ def stopped(run: Run, steps: int) -> Run:
     return scene, dano.Trajectory(times, states, residuals, iterations, converged, whole.names)
 
 
+@pytest.mark.parametrize(
+    ("field", "column", "by", "is_new"),
+    [
+        ("position", 0, 1e-7, False),
+        ("position", 0, 1e-3, True),
+        ("orientation", 2, 1e-7, False),
+        ("orientation", 2, 2e-3, True),
+        ("camera", 0, 1e-7, False),
+        ("camera", 0, 1e-3, True),
+    ],
+)
+def test_frames_in_which_nothing_is_seen_to_move_are_drawn_once(run: Run, field, column, by, is_new):
+    # A pixel spans some 2 cm at the ball; what moves by less than a fiftieth of that is not drawn again.
+    take = _video.take_of(*run, stage(run[0]), 3, VideoOptions(size=SIZE, contact_points=False))
+    still = take._replace(
+        position=np.repeat(take.position[:1], 3, axis=0),
+        orientation=np.repeat(take.orientation[:1], 3, axis=0),
+    )
+    places = np.tile([0.0, -2.0, 0.5], (3, 1))
+    moved = places if field == "camera" else getattr(still, field)[:, 0]
+    moved[1, column] += by
+    moved[2, column] += by
+    cameras = [Camera(place, place + [0, 2.0, -0.3], width=SIZE[0], height=SIZE[1]) for place in places]
+    first = _video._first_alike(still, cameras)
+    assert first.tolist() == ([0, 1, 1] if is_new else [0, 0, 0])
+    pictures = _video._painter(still, cameras, True)
+    assert (pictures(1) != pictures(0)).any() == is_new
+
+
+def test_a_creep_too_slow_to_be_seen_from_frame_to_frame_is_seen_in_the_end(run: Run):
+    take = _video.take_of(*run, stage(run[0]), 200, VideoOptions(size=SIZE, contact_points=False))
+    position = np.repeat(take.position[:1], 200, axis=0)
+    position[:, 0, 0] += 1e-5 * np.arange(200)
+    take = take._replace(position=position, orientation=np.repeat(take.orientation[:1], 200, axis=0))
+    camera = Camera((0, -2, 0.5), (0, 0, 0.2), width=SIZE[0], height=SIZE[1])
+    first = _video._first_alike(take, [camera] * 200)
+    pixel = camera.pixel_angle * np.linalg.norm(position[0, 0] - camera.position)
+    assert 4 < len(set(first)) < 20
+    assert np.abs(position[:, 0, 0] - position[first, 0, 0]).max() < 0.02 * pixel
+
+
 def test_two_runs_are_side_by_side_and_the_shorter_one_stands_at_its_end(run: Run, tmp_path):
     path, strip = tmp_path / "both.mp4", tmp_path / "both.png"
     (scene, whole), (_, half) = run, stopped(run, 25)

@@ -96,6 +96,42 @@ def test_the_shadow_lies_opposite_to_the_lamp():
     assert shadowed[y_other, x_other] == pytest.approx(bare[y_other, x_other], abs=12)
 
 
+def test_rays_of_a_pixel_get_the_light_that_each_would_get_alone():
+    items = [Item(Sphere(0.2), Pose((0.0, 0.0, 0.35))), Item(Box((0.1, 0.1, 0.1)), Pose((0.3, 0.1, 0.1)))]
+    things = [
+        Thing(item.shape, np.eye(3), np.asarray(item.pose.position), *item.placed_ball, False)
+        for item in items
+    ]
+    camera = Camera((0.6, -1.5, 1.2), (0.1, 0.0, 0.15), width=160, height=120)
+    light = np.array([0.6, -0.3, 1.0])
+    tracer = Tracer(
+        things,
+        [np.array([0.0, 0.0, 1.0, 0.0])],
+        camera.position,
+        light=light / np.linalg.norm(light),
+        focus=ZERO,
+        spread=0.08,
+        pixel=camera.pixel_angle,
+        far=5.0,
+        floor_reach=0.1,
+        shaded=True,
+    )
+    y, x = np.mgrid[:120, :160]
+    corners = np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])
+    points = (np.stack([x.ravel(), y.ravel()], axis=1)[:, None] + corners).reshape(-1, 2)
+    d = camera.directions(points).T.astype(np.float32)
+    alone, shared = tracer(d), tracer(d, together=4)
+    np.testing.assert_array_equal(shared.which, alone.which)
+    for each, other in ((shared.lamp, alone.lamp), (shared.ambient, alone.ambient)):
+        assert other.min() < 0.4 < 0.99 < other.max()
+        # The mean of a pixel's four rays is what is shown.
+        off = np.abs((each - other).reshape(-1, 4).mean(axis=1))
+        lit = other.reshape(-1, 4).min(axis=1) < 1
+        # A few pixels hold an edge between light and shade of the solid's own.
+        assert np.quantile(off[lit], 0.98) < 0.02
+        assert off.max() < 0.1
+
+
 def test_level_surface_of_a_smooth_density_is_where_the_density_says():
     line = np.linspace(-1, 1, 41)
     x, y, z = np.meshgrid(line, line, line, indexing="ij")

@@ -1,6 +1,7 @@
 """Videos and picture strips of trajectories."""
 
 import contextlib
+import functools
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -28,7 +29,7 @@ from dano.report._overlay import draw_clock, draw_label, draw_touches, side_by_s
 from dano.report._resample import frame_times, moments_of, poses_at
 from dano.report._stage import check_run, Stage, stage, Touches, touches
 from dano.scene import Scene, State, Trajectory
-from dano.vision import AbstractCamera, Item, LearnedField, prepare, render
+from dano.vision import AbstractCamera, Camera, Item, LearnedField, prepare, render
 
 MOST_PIXELS = 8192
 """Longest side of a film: what common decoders of H.264 can show."""
@@ -40,6 +41,8 @@ _STRIP_MOMENTS = 6
 """Moments in a picture strip: two rows of three (convention)."""
 _ROW_MOMENTS = 4
 """Moments in a row of a picture strip of two runs (convention)."""
+_UNSEEN = 0.02
+"""Motion that no picture shows [pixels]: antialiased edges change by less than a step of grey or two."""
 _GHOST = 0.4
 """How much of a ghost is seen (chosen by eye)."""
 
@@ -373,23 +376,95 @@ def film(
     position = np.concatenate([take.position for take in takes], axis=1)
     moments = moments_of(position, _STRIP_MOMENTS if len(takes) == 1 else _ROW_MOMENTS)
 
+    painters = [_painter(take, cameras, not options.draft) for take in takes]
+
     def pictures(frame: int) -> list[np.ndarray]:
-        return [_picture(take, cameras[frame], frame, arrow, options) for take in takes]
+        return [
+            _picture(take, paint(frame), cameras[frame], frame, arrow, options)
+            for take, paint in zip(takes, painters, strict=True)
+        ]
 
     _write(pictures, count, moments, outputs, options.fps, progress)
 
 
+def _painter(
+    take: Take, cameras: Sequence[AbstractCamera], whole: bool
+) -> Callable[[int], UInt8[np.ndarray, "height width 3"]]:
+    """What draws the bodies of a run in a frame; frames in which nothing is seen to move are drawn once.
+
+    Args:
+        take: The run.
+        cameras: Of all frames.
+        whole: Whether with shadows and smooth edges.
+    """
+    shown = _first_alike(take, cameras)
+
+    # What is asked for next is the frame that follows.
+    @functools.lru_cache(maxsize=1)
+    def drawn(frame: int) -> UInt8[np.ndarray, "height width 3"]:
+        items = take.drawn.posed(take.position[frame], take.orientation[frame])
+        camera = cameras[frame]
+        image = render(items, camera, floor=False, antialias=whole, shadows=whole)
+        if take.ghosts:
+            both = render([*items, *take.ghosts], camera, floor=False, antialias=whole, shadows=whole)
+            image = np.round((1 - _GHOST) * image + _GHOST * both.astype(float)).astype(np.uint8)
+        return image
+
+    return lambda frame: drawn(int(shown[frame])).copy()
+
+
+def _first_alike(take: Take, cameras: Sequence[AbstractCamera]) -> Int[np.ndarray, " frames"]:
+    """For each frame, the first one of those since which nothing is seen to move."""
+    first = np.zeros(len(take.times), dtype=int)
+    for frame in range(1, len(first)):
+        before = int(first[frame - 1])
+        first[frame] = before if _seen_to_move(take, cameras, before, frame) < _UNSEEN else frame
+    return first
+
+
+def _seen_to_move(take: Take, cameras: Sequence[AbstractCamera], before: int, now: int) -> float:
+    """A bound on how far anything moves in the picture [pixels] between two frames."""
+    old, camera = cameras[before], cameras[now]
+    if camera is not old and not _is_shifted(camera, old):
+        return np.inf
+    stage = take.drawn
+    bounded = np.array([item.plane is None for item in stage.items])
+    offset = np.linalg.norm(np.reshape(stage.offsets, (-1, 3)), axis=1)
+    reach = offset + [float(np.linalg.norm(item.centre)) + item.radius for item in stage.items]
+    place, start = (take.position[k][stage.rows] for k in (now, before))
+    turned, straight = (take.orientation[k][stage.rows] for k in (now, before))
+    # Quaternions of both signs are one orientation.
+    angle = 2 * np.minimum(*(np.linalg.norm(turned - sign * straight, axis=1) for sign in (1, -1)))
+    if (angle[~bounded] > 0).any():
+        return np.inf
+    way = np.linalg.norm(place - start, axis=1) + np.linalg.norm(camera.position - old.position)
+    way[bounded] += angle[bounded] * reach[bounded]
+    away = np.linalg.norm(place - camera.position, axis=1) - reach
+    near = np.maximum(away[bounded].min(initial=np.inf), 1e-3)
+    return float(way.max(initial=0) / (near * camera.pixel_angle))
+
+
+def _is_shifted(camera: AbstractCamera, other: AbstractCamera) -> bool:
+    """Whether two cameras differ in where they are alone."""
+    return (
+        isinstance(camera, Camera)
+        and isinstance(other, Camera)
+        and (camera.width, camera.height, camera.vertical_fov)
+        == (other.width, other.height, other.vertical_fov)
+        and bool(np.abs(camera.axes - other.axes).max() < _UNSEEN * camera.pixel_angle)
+    )
+
+
 def _picture(
-    take: Take, camera: AbstractCamera, frame: int, arrow: float, options: VideoOptions
+    take: Take,
+    image: UInt8[np.ndarray, "height width 3"],
+    camera: AbstractCamera,
+    frame: int,
+    arrow: float,
+    options: VideoOptions,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """A frame of a run; `arrow`: length [m] of a usual force."""
+    """A frame of a run, on the picture of its bodies; `arrow`: length [m] of a usual force."""
     drawn, position = take.drawn, take.position[frame]
-    items = drawn.posed(position, take.orientation[frame])
-    whole = not options.draft
-    image = render(items, camera, floor=False, antialias=whole, shadows=whole)
-    if take.ghosts:
-        both = render([*items, *take.ghosts], camera, floor=False, antialias=whole, shadows=whole)
-        image = np.round((1 - _GHOST) * image + _GHOST * both.astype(float)).astype(np.uint8)
     if take.touched is not None:
         image = draw_touches(image, camera, take.touched, frame, arrow)
     if options.clock:

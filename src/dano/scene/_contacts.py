@@ -167,14 +167,15 @@ def pressing_pairs(bodies: Sequence[Body], ends: Sequence[tuple[int, int]]) -> l
     Both bodies' samples do where both have some. Against a ball or an ellipsoid a box's do not: the ball's
     own lie where it comes closest, and are enough.
     """
+    turning = [None if body.surface is None else body.surface.turning for body in bodies]
+    is_object = [body.object is not None for body in bodies]
+    has_solid = [body.solid is not None for body in bodies]
     pairs = []
     for k, pair in enumerate(ends):
         for i, j in (pair, pair[::-1]):
-            first, second = bodies[i], bodies[j]
-            if first.surface is None or second.solid is None:
+            if turning[i] is None or not has_solid[j]:
                 continue
-            ball = second.surface is not None and second.surface.turning == "ball"
-            if first.object is None and first.surface.turning != "ball" and ball:
+            if turning[j] == "ball" and turning[i] != "ball" and not is_object[i]:
                 continue
             pairs.append((i, j, k))
     return pairs

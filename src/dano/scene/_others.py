@@ -105,14 +105,17 @@ def others_of(
             law.check(given)
     left_out = {frozenset(pair) for pair in apart} | {frozenset((c.a, c.b)) for c in contacts}
     neighbours = joined(joints)
-    finite = [bool(np.isfinite(body.size)) for body in bodies]
+    ends = [_Ends.of(body, True) for body in bodies]
     pairs = []
-    for (i, a), (j, b) in itertools.combinations(enumerate(bodies), 2):
-        if (a.fixed and b.fixed) or frozenset((a.name, b.name)) in left_out or neighbours(a.name, b.name):
+    for (i, a), (j, b) in itertools.combinations(enumerate(ends), 2):
+        if (a.fixed and b.fixed) or (left_out and frozenset((a.name, b.name)) in left_out):
             continue
-        if a.object is not None and b.object is not None:
-            check_objects(Contact(a.name, b.name), a.object, b.object)
-        if finite[i] or finite[j]:
+        if joints and neighbours(a.name, b.name):
+            continue
+        first, second = bodies[i].object, bodies[j].object
+        if first is not None and second is not None:
+            check_objects(Contact(a.name, b.name), first, second)
+        if a.finite or b.finite:
             pairs.append((i, j))
     if not pairs:
         return tuple(bodies), None
@@ -160,21 +163,35 @@ def touching_pairs(
         presses: Whether the law of the contacts acts at points, see `AbstractContactLaw`.
     """
     apart = joined(joints)
+    ends = [_Ends.of(body, presses) for body in bodies]
     return [
         (a.name, b.name)
-        for a, b in itertools.combinations(bodies, 2)
-        if a.name != b.name and not apart(a.name, b.name) and _can_touch(a, b, presses=presses)
+        for a, b in itertools.combinations(ends, 2)
+        if a.name != b.name and a.can_touch(b) and not apart(a.name, b.name)
     ]
 
 
-def _can_touch(a: Body, b: Body, *, presses: bool) -> bool:
-    """Whether `Scene.create` would accept a contact between two bodies."""
-    if a.fixed and b.fixed:
-        return False
-    if a.object is not None and b.object is not None:
-        met = [x.object.solid if presses else x.object.grid for x in (a, b) if x.object is not None]
-        return any(x is not None for x in met)
-    return math.isfinite(a.size) or math.isfinite(b.size)
+class _Ends(NamedTuple):
+    """What decides whether `Scene.create` would accept a contact of a body with another."""
+
+    name: str
+    fixed: bool
+    is_object: bool
+    has_solid: bool  # Of an object: whether others' samples can ask it
+    finite: bool
+
+    @classmethod
+    def of(cls, body: Body, presses: bool) -> "_Ends":
+        obj = body.object
+        solid = None if obj is None else obj.solid if presses else obj.grid
+        return cls(body.name, body.fixed, obj is not None, solid is not None, math.isfinite(body.size))
+
+    def can_touch(self, other: "_Ends") -> bool:
+        if self.fixed and other.fixed:
+            return False
+        if self.is_object and other.is_object:
+            return self.has_solid or other.has_solid
+        return self.finite or other.finite
 
 
 def _check_apart(bodies: Sequence[Body], apart: Sequence[tuple[str, str]]) -> None:

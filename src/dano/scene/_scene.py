@@ -220,7 +220,8 @@ class Scene(eqx.Module):
         """Names of the bodies of all pairs that may touch: those of `contacts`, then those of `others`."""
         rest = () if self.others is None else self.others.pairs
         named = tuple((contact.a, contact.b) for contact in self.contacts)
-        return (*named, *((self.names[i], self.names[j]) for i, j in rest))
+        names = self.names
+        return (*named, *((names[i], names[j]) for i, j in rest))
 
     @property
     def _meeting(self) -> set[str]:

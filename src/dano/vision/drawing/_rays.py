@@ -93,13 +93,14 @@ class Tracer:
         }
         self._numbers = {f"view.{name}": value for name, value in {"origin": origin, **numbers}.items()}
 
-    def __call__(self, directions: Float[np.ndarray, "3 n"], regular: int = 0) -> Met:
+    def __call__(self, directions: Float[np.ndarray, "3 n"], regular: int = 0, together: int = 1) -> Met:
         """What rays of some unit directions [W] meet.
 
         Args:
             directions: Of the rays; neighbours share much of the work if they stand together.
             regular: How many of them, from the first on, come in blocks of 4 × 4 pixels: see
                 `dano.vision.radiance.pixel_order`.
+            together: How many in a row go around one pixel; a divisor of a block's 16.
         """
         n = directions.shape[1]
         rays = np.ascontiguousarray(directions.T, np.float32)
@@ -112,8 +113,9 @@ class Tracer:
         written = (rays, depth, which, normals, lamp, ambient)
         names = ("directions", "depths", "which", "normals", "lamp", "ambient")
         of_rays = {f"rays.{name}": values for name, values in zip(names, written, strict=True)}
-        _launch(self._kernel, self._arrays, self._numbers, of_rays, block=_BLOCK, regular=regular)
-        return Met(depth, which, np.ascontiguousarray(normals.T), lamp, ambient)
+        numbers = {**self._numbers, "rays.together": together}
+        _launch(self._kernel, self._arrays, numbers, of_rays, block=_BLOCK, regular=regular)
+        return Met(depth, which, normals.T, lamp, ambient)
 
 
 class Painter:
@@ -151,7 +153,7 @@ class Painter:
             "picture": picture,
         }
         _launch(self._kernel, self._arrays, self._numbers, arrays)
-        return np.ascontiguousarray(colours.T), picture
+        return colours.T, picture
 
 
 def compile_kernels() -> None:

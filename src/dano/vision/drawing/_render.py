@@ -141,7 +141,7 @@ def render(
     view = _View(items, camera, surroundings, floor, shadows)
     rays = _rays_of(camera)
     order = rays.order
-    drawn, touched = _drawn(view, rays.directions, rays.regular)
+    drawn, touched = _drawn(view, rays.directions.T, rays.regular)
     picture = np.empty((len(order), 3), dtype=np.uint8)
     picture[order] = drawn
     if antialias and touched.any():
@@ -151,7 +151,8 @@ def render(
         for start in range(0, len(edges), _AT_ONCE):
             part = edges[start : start + _AT_ONCE]
             points = np.stack([part % camera.width, part // camera.width], axis=1)[:, None] + 0.5 + _WITHIN
-            drawn, _ = _drawn(view, camera.directions(points.reshape(-1, 2)).T.astype(np.float32))
+            towards = camera.directions(points.reshape(-1, 2)).astype(np.float32)
+            drawn, _ = _drawn(view, towards.T, together=len(_WITHIN))
             # Averaged after the transfer curve: before it, bright pixels would eat into dark edges.
             picture[part] = np.rint(drawn.reshape(-1, 4, 3).mean(axis=1)).astype(np.uint8)
     return picture.reshape(camera.height, camera.width, 3)
@@ -163,7 +164,7 @@ class _Rays(NamedTuple):
     order: Int[np.ndarray, " n"]  # Its pixel (n,)
     rank: Int[np.ndarray, " n"]  # The ray of each pixel (n,)
     regular: int  # See `pixel_order`
-    directions: Float[np.ndarray, "3 n"]  # Unit vectors [W] (3, n)
+    directions: Float[np.ndarray, "n 3"]  # Unit vectors [W] (n, 3)
 
 
 _kept: dict[bytes, _Rays] = {}
@@ -183,12 +184,13 @@ def _rays_of(camera: AbstractCamera) -> _Rays:
     if key not in _kept:
         order, regular = pixel_order(width, height)
         points = np.stack([order % width, order // width], axis=1) + 0.5
-        own = np.ascontiguousarray((camera.directions(points) @ axes.T).T, dtype=np.float32)
+        own = np.asarray(camera.directions(points) @ axes.T, dtype=np.float32)
         # One is enough: pictures come in series.
         _kept.clear()
         _kept[key] = _Rays(order, np.argsort(order), regular, own)
     kept = _kept[key]
-    return kept._replace(directions=axes.T.astype(np.float32) @ kept.directions)
+    # Not as a product of matrices: that wakes threads, which spin for longer than it takes.
+    return kept._replace(directions=np.einsum("nj,ji->ni", kept.directions, axes.astype(np.float32)))
 
 
 def _surroundings(
@@ -256,10 +258,10 @@ def prepare(items: Sequence[Item], camera: AbstractCamera) -> None:
 
 
 def _drawn(
-    view: _View, d: np.ndarray, regular: int = 0
+    view: _View, d: np.ndarray, regular: int = 0, together: int = 1
 ) -> tuple[UInt8[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Picture of rays, and which of them see more than empty surroundings; `regular` as `Tracer` takes it."""
-    met = view.tracer(d, regular)
+    """Picture of rays, and which of them see more than empty surroundings; the rest as `Tracer` takes it."""
+    met = view.tracer(d, regular, together)
     if view.cloud_parts:
         _darken_by_clouds(view, d, met)
     touched = (met.which >= len(view.planes)) | (met.lamp < 1) | (met.ambient < 1)

@@ -41,8 +41,8 @@ _BLOCK = wp.constant(BLOCK)
 _TO_CORNER, _INNER = wp.constant(5), wp.constant(12)
 # A cone ends where what is free around it is less than this share of its radius.
 _NARROW = wp.constant(real(0.5))
-# Light of a block is interpolated if normals agree to this cosine, corners to this share of all light, and
-# the inner ray to that one: a step of grey or two.
+# Light is shared by a block, or a pixel, if normals agree to this cosine, corners to this share of all light,
+# and the inner ray to that one: a step of grey or two.
 _SAME_SIDE, _EVEN, _EXACT = wp.constant(real(0.9)), wp.constant(real(0.15)), wp.constant(real(0.015))
 # … and if a shadow changes by less than this share of a lamp's disc from one ray to the others.
 _GENTLE = wp.constant(real(1.2))
@@ -121,15 +121,6 @@ def way_through(low: vec3, high: vec3, o: vec3, d: vec3) -> Way:
     return way
 
 
-@wp.func
-def meets_ball(thing: Thing, o: vec3, d: vec3) -> bool:
-    """Whether a ray meets the ball around a thing."""
-    away = thing.centre - o
-    along = wp.dot(away, d)
-    beside = wp.dot(away, away) - thing.radius * thing.radius
-    return beside <= ZERO or (along > ZERO and along * along > beside)
-
-
 @wp.struct
 class Cone:
     """Some rays from one point together."""
@@ -139,21 +130,36 @@ class Cone:
 
 
 @wp.func
+def may_meet(view: View, thing: Thing, cone: Cone) -> bool:
+    """Whether a ray of a cone may meet the ball around a thing."""
+    away = thing.centre - view.origin
+    square = wp.dot(away, away)
+    # A ray that meets the ball does so before it has gone this far, and is no further from the axis there.
+    radius = thing.radius + cone.width * (wp.sqrt(square) + thing.radius)
+    along = wp.dot(away, cone.axis)
+    beside = square - radius * radius
+    return beside <= ZERO or (along > ZERO and along * along > beside)
+
+
+@wp.func
 def cone_around(directions: wp.array(dtype=wp.vec3f), first: int, end: int) -> Cone:
     """The cone around rays of some numbers."""
     cone = Cone()
     for r in range(first, end):
         cone.axis += direction_of(directions, r)
     cone.axis = wp.normalize(cone.axis)
+    square = real(0.0)
     for r in range(first, end):
-        cone.width = wp.max(cone.width, wp.length(direction_of(directions, r) - cone.axis))
+        beside = direction_of(directions, r) - cone.axis
+        square = wp.max(square, wp.dot(beside, beside))
+    cone.width = wp.sqrt(square)
     return cone
 
 
 @wp.func
 def direction_of(directions: wp.array(dtype=wp.vec3f), r: int) -> vec3:
-    """Unit direction of a ray [W]."""
-    return wp.normalize(vec3(real(directions[r][0]), real(directions[r][1]), real(directions[r][2])))
+    """Unit direction of a ray [W], to the rounding of 32 bits."""
+    return vec3(real(directions[r][0]), real(directions[r][1]), real(directions[r][2]))
 
 
 @wp.func
@@ -345,6 +351,7 @@ class Rays:
         lamp: Written: shares of the lamp's light that arrive.
         ambient: Written: shares of light from all around.
         regular: How many of them, from the first on, come in blocks of 4 × 4 pixels.
+        together: How many in a row go around one pixel.
     """
 
     directions: wp.array(dtype=wp.vec3f)
@@ -354,6 +361,7 @@ class Rays:
     lamp: wp.array(dtype=wp.float32)
     ambient: wp.array(dtype=wp.float32)
     regular: int
+    together: int
 
 
 @wp.func
@@ -393,14 +401,12 @@ def meet_planes(view: View, rays: Rays, r: int):
 def meet_thing(view: View, rays: Rays, k: int, first: int, end: int, cone: Cone):
     """Where rays of a block meet a thing, if nothing stands before it."""
     thing = view.things[k]
+    if not may_meet(view, thing, cone):
+        return
     limit = real(0.0)
-    some = bool(False)
     for r in range(first, end):
         limit = wp.max(limit, wp.min(real(rays.depths[r]), real(INFINITY)))
-        some = some or meets_ball(thing, view.origin, direction_of(rays.directions, r))
-    begin = real(INFINITY)
-    if some:
-        begin = free_along(view, thing, cone, limit)
+    begin = free_along(view, thing, cone, limit)
     if begin < limit:
         for r in range(first, end):
             d = direction_of(rays.directions, r)
@@ -412,17 +418,17 @@ def meet_thing(view: View, rays: Rays, k: int, first: int, end: int, cone: Cone)
 
 
 @wp.func
-def is_one_side(rays: Rays, first: int) -> bool:
-    """Whether all rays of a block end on one thing, or plane, and on one side of it."""
+def is_one_side(rays: Rays, first: int, end: int) -> bool:
+    """Whether some rays end on one thing, or plane, and on one side of it."""
     met = rays.which[first]
     same = met >= 0
-    for i in range(1, _BLOCK):
-        if same and rays.which[first + i] != met:
+    for r in range(first + 1, end):
+        if same and rays.which[r] != met:
             same = False
     if same:
         normal = normal_met(rays, first)
-        for i in range(1, _BLOCK):
-            if wp.dot(normal, normal_met(rays, first + i)) < _SAME_SIDE:
+        for r in range(first + 1, end):
+            if wp.dot(normal, normal_met(rays, r)) < _SAME_SIDE:
                 same = False
     return same
 
@@ -459,21 +465,24 @@ def lighten(view: View, rays: Rays, r: int, beside: real) -> Light:
 
 
 @wp.func
-def is_lit_together(view: View, rays: Rays, first: int, cone: Cone, is_regular: bool) -> bool:
-    """Light a block by some of its rays, if that is right: all alike, or, of regular pixels, interpolated."""
-    if not is_one_side(rays, first):
+def reach_beside(view: View, rays: Rays, r: int, width: real) -> real:
+    """How far beside a ray's end others end [m] that differ by `width`: further at a slant."""
+    slant = -wp.dot(normal_met(rays, r), direction_of(rays.directions, r))
+    return width * real(rays.depths[r]) / wp.max(slant, _GRAZING)
+
+
+@wp.func
+def is_lit_together(view: View, rays: Rays, first: int, cone: Cone) -> bool:
+    """Light a block of pixels by some of its rays, if that is right: by one, or interpolated between five."""
+    if not is_one_side(rays, first, first + _BLOCK):
         return False
-    # How far the other rays end at most: as the cone is wide, and more where the surface is seen at an angle.
-    slant = real(1.0)
-    far = real(0.0)
+    beside = real(0.0)
     for i in range(4):
         r = first + i * _TO_CORNER
-        slant = wp.min(slant, -wp.dot(normal_met(rays, r), direction_of(rays.directions, r)))
-        far = wp.max(far, real(rays.depths[r]))
-    beside = TWO * cone.width * far / wp.max(slant, _GRAZING)
+        beside = wp.max(beside, reach_beside(view, rays, r, TWO * cone.width))
     inner = lighten(view, rays, first + _INNER, beside)
-    if inner.whole or not is_regular:
-        return inner.whole
+    if inner.whole:
+        return True
     steep = inner.steep
     for i in range(4):
         corner = lighten(view, rays, first + i * _TO_CORNER, beside)
@@ -491,6 +500,31 @@ def is_lit_together(view: View, rays: Rays, first: int, cone: Cone, is_regular: 
             rays.lamp[first + i] = wp.float32(between(rays.lamp, first, i))
             rays.ambient[first + i] = wp.float32(between(rays.ambient, first, i))
     return True
+
+
+@wp.func
+def light_pixel(view: View, rays: Rays, first: int, end: int):
+    """Light the rays of a pixel: by two opposite ones, if they end on one side of a thing in gentle light.
+
+    The mean of these is that of all where light varies linearly.
+    """
+    opposite = (first + end) // 2
+    shared = end > first + 1 and is_one_side(rays, first, end)
+    if shared:
+        beside = reach_beside(view, rays, first, view.pixel)
+        one = lighten(view, rays, first, beside)
+        if not one.whole:
+            other = lighten(view, rays, opposite, beside)
+            shared = wp.max(one.steep, other.steep) * beside <= _GENTLE
+            shared = shared and wp.abs(one.lamp - other.lamp) <= _EVEN
+            shared = shared and wp.abs(one.ambient - other.ambient) <= _EVEN
+    for r in range(first, end):
+        if shared:
+            half = wp.where(r < opposite, first, opposite)
+            rays.lamp[r] = rays.lamp[half]
+            rays.ambient[r] = rays.ambient[half]
+        elif rays.which[r] >= 0:
+            lighten(view, rays, r, ZERO)
 
 
 @wp.kernel(enable_backward=False)
@@ -515,9 +549,8 @@ def trace(view: View, rays: Rays):
             n = normal_of(view, view.things[rays.which[r] - planes], x)
             rays.normals[r] = wp.vec3f(wp.float32(n[0]), wp.float32(n[1]), wp.float32(n[2]))
     done = bool(False)
-    if end == first + _BLOCK:
-        done = is_lit_together(view, rays, first, cone, end <= rays.regular)
+    if end == first + _BLOCK and end <= rays.regular:
+        done = is_lit_together(view, rays, first, cone)
     if not done:
-        for r in range(first, end):
-            if rays.which[r] >= 0:
-                lighten(view, rays, r, ZERO)
+        for r in range(first, end, rays.together):
+            light_pixel(view, rays, r, wp.min(r + rays.together, end))
