@@ -1,10 +1,14 @@
 """Real recordings: readers refuse what is broken, and a few rows are predicted as the stored results say."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import dano
+
 pytest.importorskip("benchmarks.real._data", reason="benchmarks are not part of an installed dano")
-from benchmarks.real import _impacts, _points, _pushes, _squares
+from benchmarks.real import _frictions, _impacts, _points, _pushes, _squares, _tools
 from benchmarks.real._data import data_folder, Impacts, NO_DATA, Source
 
 
@@ -60,6 +64,41 @@ def test_a_pusher_in_the_middle_pushes_straight():
     assert np.allclose(poses[-1], [0.1, 0.0, 0.0], atol=1e-9)
     ours = _pushes.simulated([push], measuring, {"friction": 0.3, "feet": 0.04})[0]
     assert np.allclose(ours[-1], [0.1, 0.0, 0.0], atol=2e-3)
+
+
+def test_intervals_for_one_more_recording_hold_as_often_as_they_say():
+    random = np.random.default_rng(0)
+    held = [_frictions.predicted(0.2 + 0.03 * random.standard_normal(6))[0] for _ in range(500)]
+    # 3,000 recordings, six by six not independent: one per cent.
+    assert np.mean(held) == pytest.approx(95.0, abs=1.5)
+
+
+def test_materials_are_found_from_the_weight():
+    trimesh = pytest.importorskip("trimesh")
+    # A head on a handle, with a pin: colours tell the pin from the rest, but not the head from the handle.
+    pieces = [trimesh.creation.box((30.0, 30.0, 200.0)), trimesh.creation.box((100.0, 20.0, 20.0))]
+    pieces.append(trimesh.creation.box((5.0, 5.0, 20.0)))
+    for piece, colour in zip(pieces, ((200, 200, 200), (200, 200, 200), (200, 150, 0)), strict=True):
+        piece.visual.face_colors = (*colour, 255)
+    truth = (560.0, 7800.0, 8500.0)
+    mass = sum(d * 1e-9 * abs(p.volume) for d, p in zip(truth, pieces, strict=True))
+    empty = np.zeros(3), np.eye(3), np.eye(4)
+
+    def found(weight, sheet="handle: oak\nhead: cast carbon steel\npin: brass"):
+        return _tools.densities(_tools.Tool("tool", Path("tool.ply"), weight, *empty, sheet), pieces)
+
+    assert found(mass) == truth
+    with pytest.raises(ValueError, match=r"no choice of \[560.0, 7800.0, 8500.0\] kg/m³ for 3 parts"):
+        found(3 * mass)
+
+
+def test_a_wrists_log_is_that_of_the_load():
+    centre, inertia = np.array([0.02, 0.01, 0.1]), np.diag([3e-3, 2.5e-3, 1e-3])
+    log = _tools.wrist_log(0.5, centre, inertia, 0)
+    found = dano.identify_load(log)
+    assert abs(found.mass / 0.5 - 1) < 0.02 and np.abs(found.centre - centre).max() < 2e-3
+    low, high = found.interval("inertia")
+    assert np.mean((low <= inertia) & (inertia <= high)) > 0.7
 
 
 @pytest.mark.parametrize("name", ["impacts.npz", "square_drops.npz"])

@@ -4,6 +4,7 @@ They are not ours to redistribute. `DANO_REAL_DATA` names a folder with `impacts
 `push_*.npz` and `tools/`.
 """
 
+import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,6 +90,10 @@ class Impacts:
 
     def __len__(self) -> int:
         return len(self.before)
+
+    def some(self, chosen: np.ndarray) -> "Impacts":
+        """Those with these indices."""
+        return Impacts(*(getattr(self, field.name)[chosen] for field in dataclasses.fields(self)))
 
 
 def members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -53,7 +53,7 @@ def rows(source: Source | None, *, quick: bool = False) -> list[Row]:
     if source is None:
         return [skipped("Impacts of an ellipse", "all of them", NO_DATA)]
     fitted, held = source.split("impacts.npz", Impacts.load)
-    fit = identify(fitted if not quick else _some(fitted, 60))
+    fit = identify(fitted if not quick else fitted.some(np.arange(60)))
     constants = {name: float(fit.values[name]) for name in PARAMETERS}
     group = "Impacts of an ellipse: dano"
     note = f"{source.words}; {len(held)} impacts"
@@ -92,15 +92,23 @@ def scene(friction: float = 0.3, restitution: float = 0.5) -> dano.Scene:
     )
 
 
-def identify(impacts: Impacts) -> dano.Identification:
+def identify(
+    impacts: Impacts, *, independent: str = "numbers", after: dano.Identification | None = None
+) -> dano.Identification:
     """Friction and restitution by `dano.identify`, each impact a motion of two frames."""
-    options = dano.IdentifyOptions(huber=HUBER)
+    options = dano.IdentifyOptions(huber=HUBER, independent=independent)
     motions = [_motion(impacts, i) for i in range(len(impacts))]
     with warnings.catch_warnings():
         # That a frame takes the body less far than its size, or that residuals are those of a law.
         warnings.simplefilter("ignore")
         return dano.identify(
-            scene(), motions, list(PARAMETERS.values()), initial="given", noise=NOISE, options=options
+            scene(),
+            motions,
+            list(PARAMETERS.values()),
+            initial="given",
+            noise=NOISE,
+            after=after,
+            options=options,
         )
 
 
@@ -137,12 +145,6 @@ def _motion(impacts: Impacts, i: int) -> dano.Motion:
     )
 
 
-def _some(impacts: Impacts, n: int | np.ndarray) -> Impacts:
-    chosen = np.arange(min(n, len(impacts))) if isinstance(n, int) else n
-    arrays = (impacts.before, impacts.after, impacts.normal, impacts.tangent, impacts.published)
-    return Impacts(*(array[chosen] for array in arrays))
-
-
 def _errors(
     group: str, held: Impacts, after: np.ndarray, *, name: str = "", targets=(None, None), note: str = ""
 ) -> list[Row]:
@@ -166,7 +168,7 @@ def _median_error(values: np.ndarray) -> float:
 
 def _between_parts(group: str, fitted: Impacts, whole: dano.Identification) -> list[Row]:
     """How constants of disjoint parts of the half scatter, in the standard errors that they state."""
-    parts = [identify(_some(fitted, np.arange(k, len(fitted), PARTS_OF_HALF))) for k in range(PARTS_OF_HALF)]
+    parts = [identify(fitted.some(np.arange(k, len(fitted), PARTS_OF_HALF))) for k in range(PARTS_OF_HALF)]
     found = []
     for name in PARAMETERS:
         inside = sum(p.interval(name)[0] <= whole.values[name] <= p.interval(name)[1] for p in parts)
@@ -273,7 +275,7 @@ def picture(source: Source, folder: Path) -> Path:
     from benchmarks.real._pictures import scatter
 
     fitted, held = source.split("impacts.npz", Impacts.load)
-    fit = identify(_some(fitted, 120))
+    fit = identify(fitted.some(np.arange(120)))
     after = simulated(held, **{name: float(fit.values[name]) for name in PARAMETERS})
     seen = held.after[:, 3:]
     panels = [

@@ -36,6 +36,9 @@ MOTOR = 1e6  # N/m: a push of 5 N moves it back by 5 µm
 MEASURING = {"radius": 0.0048, "scale": -0.0055, "x": 0.0, "y": 0.0}
 SIZES = {"radius": 3e-4, "scale": 1e-3, "x": 5e-4, "y": 5e-4}
 
+# Frames that tell how fast the block is: 40 ms, in which it moves by 2 mm.
+_FIRST = 10
+
 # A stretch that ends so far off [mm; ° count half] counts half: blows would drown the others.
 _HALF_OFF = 2.0
 
@@ -140,7 +143,7 @@ def rows(source: Source | None, *, quick: bool = False) -> list[Row]:
     for key, value in measuring.items():
         unit = "" if key == "scale" else "mm"
         found.append(Row("Pushes: the measurement", key, value if key == "scale" else 1e3 * value, unit))
-    return found + _frictions([*fitted, *held], measuring, ours, quick)
+    return found
 
 
 def ends(pushes: Sequence[Push], poses: Sequence[np.ndarray]) -> np.ndarray:
@@ -287,14 +290,18 @@ def simulated(
     return [pose[: len(push)] for pose, push in zip(poses, pushes, strict=True)]
 
 
-def start(made: dano.Scene, push: Push, path: np.ndarray) -> dano.State:
-    """The block where it was recorded, at rest on the table."""
+def start(made: dano.Scene, push: Push, path: np.ndarray, *, moving: bool = False) -> dano.State:
+    """The block where it was recorded, on the table: at rest, or as fast as in its first frames."""
     x, y, angle = push.block[0]
+    frames = np.arange(_FIRST)
+    rate = np.polyfit(frames * FRAME, push.block[:_FIRST], 1)[0] if moving else np.zeros(3)
     speed = (path[1] - path[0]) / FRAME
     return made.initial_state(
         block={
             "position": (x, y, FOOT + HEIGHT),
             "orientation": (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)),
+            "velocity": (rate[0], rate[1], 0.0),
+            "omega": (0.0, 0.0, rate[2]),
         },
         rail={"q": path[0, 0], "v": speed[0]},
         pusher={"q": path[0, 1], "v": speed[1]},
@@ -319,81 +326,6 @@ def _fitted(pushes: Sequence[Push], measuring: Mapping[str, float], tries: int) 
         return _misfit(ends(parts, simulated(parts, measuring, values)))
 
     return _least(misfit, {"friction": 0.22, "feet": 0.050}, {"friction": 0.06, "feet": 0.006}, tries)
-
-
-# --- frictions with intervals -------------------------------------------------------------------------------
-
-
-def _frictions(pushes: Sequence[Push], measuring, values, quick: bool) -> list[Row]:
-    """Both frictions of each recording by `dano.identify`, and whether intervals agree."""
-    group = "Pushes: frictions of each recording"
-    found, fits = [], []
-    for push in pushes[: 1 if quick else None]:
-        fit = identify(push, measuring, values)
-        fits.append(fit)
-        for name in ("pusher", "table"):
-            low, high = fit.interval(name)
-            found.append(
-                Row(
-                    group,
-                    f"{name}, {push.name}",
-                    float(fit.values[name]),
-                    "",
-                    note=f"95 % {low:.3f} to {high:.3f}",
-                )
-            )
-    if len(fits) < 2:
-        return found
-    for name in ("pusher", "table"):
-        each = np.array([float(fit.values[name]) for fit in fits])
-        errors = np.array([float(fit.standard_errors[name]) for fit in fits])
-        middle = np.median(each)
-        inside = sum(fit.interval(name)[0] <= middle <= fit.interval(name)[1] for fit in fits)
-        note = f"scatter between recordings {np.std(each, ddof=1):.3f}, stated {np.median(errors):.3f}"
-        found.append(
-            Row(
-                group,
-                f"{name}: intervals that hold the median",
-                100 * inside / len(fits),
-                "%",
-                90.0,
-                True,
-                note=note,
-            )
-        )
-    return found
-
-
-def identify(push: Push, measuring: Mapping[str, float], values: Mapping[str, float]) -> dano.Identification:
-    """Friction of pusher and table from one recording, cut into windows of half a second."""
-    made = scene(measuring["radius"], **values)
-    path = push.path(measuring)
-    every = 25
-    frames = np.arange(0, len(push), every)
-    x, y, angle = push.block[frames].T
-    still = np.zeros_like(x)
-    motion = dano.Motion.create(
-        frames * FRAME,
-        "block",
-        position=np.column_stack([x, y, still + FOOT + HEIGHT]),
-        orientation=np.column_stack([np.cos(angle / 2), still, still, np.sin(angle / 2)]),
-    )
-    parameters = [
-        dano.Parameter("pusher", lambda s: s.contact("pusher", "block").sliding_friction, 0.02, 1.0),
-        dano.Parameter(
-            "table", lambda s: [s.contact(f"foot{k}", "table").sliding_friction for k in range(4)], 0.02, 1.0
-        ),
-    ]
-    return dano.identify(
-        made,
-        motion,
-        parameters,
-        state=start(made, push, path),
-        controls=driven(made, path[1:]),
-        initial="given",
-        noise={"position": 1e-3, "orientation": 5e-3},
-        options=dano.IdentifyOptions(huber=1.5),
-    )
 
 
 def picture(source: Source, folder: Path) -> Path:

@@ -5,10 +5,23 @@ import functools
 from pathlib import Path
 
 from benchmarks._measure import load_average, parse_arguments, parts_option, report, rows_of_parts
-from benchmarks.real import _impacts, _pushes, _squares, _tools
+from benchmarks.real import _frictions, _impacts, _pushes, _squares, _tools
 from benchmarks.real._data import data_folder, Source
 
-PARTS = {"impacts": _impacts, "squares": _squares, "pushes": _pushes, "tools": _tools}
+PARTS = {
+    "impacts": _impacts,
+    "squares": _squares,
+    "pushes": _pushes,
+    "frictions": _frictions,
+    "tools": _tools,
+}
+
+PICTURES = {
+    "impacts": _impacts.picture,
+    "squares": _squares.picture,
+    "pushes": _pushes.picture,
+    "tools": _tools.picture,
+}
 
 
 def run() -> None:
@@ -21,7 +34,8 @@ def run() -> None:
     names, rows = rows_of_parts(parts, arguments)
     if arguments.picture is not None and source is not None:
         for name in names:
-            print(PARTS[name].picture(source, arguments.picture))
+            if name in PICTURES:
+                print(PICTURES[name](source, arguments.picture))
     settings: dict[str, object] = {"parts": names, "dtype": "float64", "quick": arguments.quick}
     report("real", rows, settings, load, arguments.json)
 

@@ -14,6 +14,7 @@ from engine.trees import coordinates
 
 import dano
 from dano.identification._parameters import space_of
+from dano.identification._uncertainty import between_groups, Groups
 from dano.identification._windows import draw_velocities, plan_windows
 from dano.maths import quat_multiply
 
@@ -150,6 +151,45 @@ def test_standard_errors_cover_the_truth(observed, n_fits, least, most, rel):
     assert np.mean([fit.standard_errors["mu"] for fit in fits]) == pytest.approx(spread, rel=rel)
     # The residuals are as large as the noise that was stated.
     assert np.mean([fit.errors.rms for fit in fits]) == pytest.approx(1.0, rel=0.1)
+
+
+def test_covariance_between_groups_is_that_of_leaving_each_out():
+    random = np.random.default_rng(0)
+    table, target = random.normal(size=(60, 3)), random.normal(size=60)
+    groups = np.repeat(np.arange(6), 10)
+    best = np.linalg.lstsq(table, target)[0]
+    without = np.array([np.linalg.lstsq(table[groups != k], target[groups != k])[0] - best for k in range(6)])
+    gradients = np.array(
+        [table[groups == k].T @ (table[groups == k] @ best - target[groups == k]) for k in range(6)]
+    )
+    hessians = np.array([table[groups == k].T @ table[groups == k] for k in range(6)])
+    found = between_groups(hessians.sum(axis=0), Groups(gradients, hessians))
+    np.testing.assert_allclose(found, without.T @ without * 5 / 6, rtol=1e-9)
+
+
+def test_motions_whose_friction_differs_say_how_sure_a_friction_is():
+    """Frames do not know that the next slide has another friction; slides do."""
+    random = np.random.default_rng(1)
+    frictions = 0.25 + 0.02 * random.standard_normal(10)
+    slides = [
+        noisy(dano.Motion.from_trajectory(sliding(ball_scene(mu)), bodies=["ball"], every=2), random)
+        for mu in frictions
+    ]
+    with pytest.warns(RuntimeWarning, match="mu: motions pull it apart by .* times its standard error"):
+        alone = dano.identify(ball_scene(), slides, [FRICTION], noise=NOISE, initial="given")
+    options = dano.IdentifyOptions(independent="motions")
+    fit = dano.identify(ball_scene(), slides, [FRICTION], noise=NOISE, initial="given", options=options)
+    assert fit.values["mu"] == alone.values["mu"] and fit.freedom == 9
+    expected = np.std(frictions, ddof=1) / np.sqrt(10)
+    assert fit.standard_errors["mu"] == pytest.approx(expected, rel=0.3)
+    assert alone.standard_errors["mu"] < 0.5 * expected
+    low, high = fit.interval("mu")
+    assert low < 0.25 < high
+    # Five recordings of two slides each: the mean of a pair scatters by less, and there are fewer of them.
+    pairs = dano.IdentifyOptions(independent=[str(k // 2) for k in range(10)])
+    fit = dano.identify(ball_scene(), slides, [FRICTION], noise=NOISE, initial="given", options=pairs)
+    expected = np.std(frictions.reshape(5, 2).mean(axis=1), ddof=1) / np.sqrt(5)
+    assert fit.freedom == 4 and fit.standard_errors["mu"] == pytest.approx(expected, rel=0.4)
 
 
 def test_outliers_pull_less_with_hubers_loss(observed):
@@ -307,6 +347,45 @@ def test_an_impact_soon_after_the_first_frame():
     assert abs(start.omega[0, 0, 2]) > 1.0
     np.testing.assert_allclose(narrow.omega[0, 0], 0, atol=1e-6)
     np.testing.assert_allclose(narrow.velocity[0, 0], run.states.velocity[0, 0], atol=0.2)
+
+
+def test_a_first_velocity_is_not_moved_across_an_impact():
+    """Half a step before its frame the ball still falls: the bounce after it says nothing of that."""
+    scene = ball_scene()
+
+    def begun(speeds, **options):
+        speeds = np.array(speeds, float)
+        heights = RADIUS + 0.02 + np.cumsum(np.append(0.0, speeds[:-1] * H))
+        motion = dano.Motion.create(
+            H * np.arange(len(speeds)),
+            "ball",
+            position=np.column_stack([0 * speeds, 0 * speeds, heights]),
+            orientation=np.tile([1.0, 0, 0, 0], (len(speeds), 1)),
+            velocity=np.column_stack([0 * speeds, 0 * speeds, speeds]),
+            omega=np.zeros((len(speeds), 3)),
+            **options,
+        )
+        plan = plan_windows(
+            scene,
+            [motion],
+            states=[None],
+            controls=[None],
+            noise=NOISE,
+            initial=(),
+            window=2,
+            continuous=False,
+        )
+        return np.asarray(plan.start.velocity[:, 0, 2])
+
+    fall = -9.81 * H
+    np.testing.assert_allclose(begun([-1.0, -1.0 + fall])[0], -1.0 - fall / 2)
+    with pytest.warns(UserWarning, match="velocity of 'ball' changes .* as by an impact, in the motion"):
+        np.testing.assert_allclose(begun([-1.0, 0.8]), [-1.0])
+    # Velocities that are known where the simulation has them need no move.
+    np.testing.assert_allclose(begun([-1.0, 0.8], lag=H / 2), [-1.0])
+    # The bounce is after the third frame, with which the second window begins: before it, it fell.
+    third = [-1.0, -1.0 + fall, -1.0 + 2 * fall, 0.9]
+    np.testing.assert_allclose(begun(third)[1], third[2] - fall / 2)
 
 
 def test_velocities_are_compared_at_their_own_times():
@@ -561,6 +640,12 @@ def test_bad_input():
     refuse("options.starts > 1 needs finite bounds", parameters=changed(upper=np.inf), options=many)
     nobody = dataclasses.replace(sliding_motion(), names=("cube",))
     refuse("bodies of the scene", observed=nobody)
+    refuse(
+        "options.independent needs at least 3 motions, two more than there are parameters, got 1",
+        options=dano.IdentifyOptions(independent="motions"),
+    )
+    labelled = dano.IdentifyOptions(independent=["a", "b"])
+    refuse("must be one label for each of 1 motions, got 2", options=labelled)
     only_turns = dataclasses.replace(sliding_motion(), position=np.full((10, 1, 3), np.nan))
     refuse("must have a frame with positions", observed=only_turns)
     only_floor = dataclasses.replace(sliding_motion(), names=("floor",))
@@ -575,6 +660,11 @@ def test_bad_input():
         ("a sequence of it must fall", {"continuity": (0.1, 0.3), "window": 4}),
         ("continuity must be finite and > 0", {"continuity": np.nan, "window": 4}),
         ("huber must be", {"huber": -1.0}),
+        ("independent must be one of numbers, windows, motions, got 'runs'", {"independent": "runs"}),
+        (
+            "independent='windows' excludes continuity",
+            {"independent": "windows", "continuity": 0.1, "window": 4},
+        ),
         ("starts must lie between", {"starts": 0}),
         ("seed must be ≥ 0", {"seed": -1}),
         ("jacobian must be one of auto, forward, reverse, got 'sideways'", {"jacobian": "sideways"}),

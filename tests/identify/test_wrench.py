@@ -179,6 +179,42 @@ def test_inertias_are_those_of_a_body():
         assert np.linalg.eigvalsh(second).min() > 0
 
 
+def test_a_shape_says_more_of_a_thin_load():
+    """Of a rod its points say that it resists turns about all axes across alike, which noise hides."""
+    rod = np.column_stack([np.zeros((4, 2)), POINTS[:, 2]])
+    corners = np.array([[x, y, z] for x in (-0.004, 0.004) for y in (-0.004, 0.004) for z in (0.04, 0.21)])
+    mass, centre = MASSES.sum(), MASSES @ rod / MASSES.sum()
+    least = 2 * 1.1 * mass * 0.004**2
+    off: dict[bool, list[float]] = {True: [], False: []}
+    inside = []
+    for seed in range(6):
+        log = dano.WristLog.create(**recorded(seconds=3.0, points=rod, noise=(2.0, 0.1), seed=seed))
+        for known in off:
+            found = dano.identify_load(log, shape=corners if known else None)
+            off[known].append(float(abs(found.inertia[0, 0] - found.inertia[1, 1])))
+            if known:
+                # No body within these corners has more about the rod.
+                assert found.inertia[2, 2] <= least
+                low, high = found.interval("centre")
+                inside.append(np.mean((low <= centre) & (centre <= high)))
+    assert np.max(off[True]) <= least and np.mean(off[False]) > 5 * np.mean(off[True])
+    assert np.mean(inside) > 0.7
+
+
+def test_shapes_that_do_not_fit_are_refused(noisy):
+    log = dano.WristLog.create(**noisy)
+    box = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (0.0, 0.25)])
+    alone, found = dano.identify_load(log), dano.identify_load(log, shape=box)
+    # A shape that excludes nothing near changes nothing but the last digits.
+    assert np.linalg.norm(found.inertia - alone.inertia) < 1e-3 * np.linalg.norm(alone.inertia)
+    with pytest.raises(ValueError, match=r"the log shows the centre of mass at .*the points reach from"):
+        dano.identify_load(log, shape=1e-3 * box)
+    with pytest.raises(ValueError, match="do not lie in one plane, got 8 points"):
+        dano.identify_load(log, shape=box * [1, 1, 0])
+    with pytest.raises(ValueError, match=r"shape \(n, 3\), got an array of shape \(8, 2\)"):
+        dano.identify_load(log, shape=box[:, :2])
+
+
 def test_tables_are_read(tmp_path, noisy):
     columns = ["time", "x", "y", "z", "qw", "qx", "qy", "qz", "fx [N]", "fy [N]", "fz [N]"]
     columns += ["mx [N mm]", "my [N mm]", "mz [N mm]"]

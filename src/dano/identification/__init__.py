@@ -12,6 +12,8 @@ from dano.identification.motions import (
 )
 from dano.identification.wrench import (
     identify_load as identify_load,
+    identify_load_on_arm as identify_load_on_arm,
+    JointLog as JointLog,
     Load as Load,
     load_wrist_log as load_wrist_log,
     WristLog as WristLog,

@@ -28,7 +28,7 @@ from dano.identification._result import Errors, Identification, Minimum
 from dano.identification._scales import check_scales
 from dano.identification._settings import deviations, estimated, IdentifyOptions, Setup
 from dano.identification._settling import ripple_covariance, worth_of
-from dano.identification._uncertainty import uncertainty
+from dano.identification._uncertainty import scattered, uncertainty
 from dano.identification._windows import Plan
 from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
@@ -128,6 +128,7 @@ def _fitted(
     began = time.perf_counter()
     tell = progress or (lambda description, share: None)
     problem = Problem(setup, motions, state)
+    problem.check_groups(setup.options.independent)
     if after is not None:
         problem.begin_near(after)
     tell("compiling", 0.0)
@@ -233,12 +234,15 @@ def _identification(
     known = np.asarray(at_best.lengths)
     seen = known[known >= 0]
     least = problem.least_variance
-    sure = uncertainty(
-        space, best.x, best.normal, seen, setup.options.huber, plan.n_data, scene, ripple, least
-    )
+    independent = setup.options.independent
+    said = (space, best.x, best.normal, seen, setup.options.huber, plan.n_data, scene, ripple, least)
+    sure = uncertainty(*said, None if independent == "numbers" else problem.groups(at_best, independent))
     values, errors = values_at(space.selections, best.x, sure.covariance)
     fit_errors = _errors(plan, motions, at_best)
     messages = list(sure.messages)
+    if independent == "numbers" and len(motions) > len(space.start) + 1:
+        between = uncertainty(*said, problem.groups(at_best, "motions"))
+        messages += scattered(space.labels, sure.covariance, between.covariance, len(motions))
     if failed := int(np.sum(np.asarray(at_best.unconverged))):
         page = see("steps-did-not-converge")
         messages.append(

@@ -18,10 +18,11 @@ from dano.identification._residuals import Linearized, linearized, losses, Model
 from dano.identification._result import Identification
 from dano.identification._settings import Setup
 from dano.identification._settling import settled
+from dano.identification._uncertainty import Groups
 from dano.identification._windows import draw_velocities, plan_windows
 from dano.identification.motions import Motion, QUANTITIES
 from dano.scene import Control, Scene, State
-from dano.solvers import bounded_least_squares, NormalEquations, Solution, Stop
+from dano.solvers import bounded_least_squares, eliminated, NormalEquations, Solution, Stop
 
 # Points whose loss is computed for each start that is refined.
 _LOOKS = 4
@@ -122,6 +123,33 @@ class Problem:
             device_mesh(),
         )
 
+    def check_groups(self, independent: str | Sequence[str]) -> None:
+        """Refuse fewer independent groups than can tell how far they pull the parameters apart.
+
+        Raises:
+            ValueError: If there are, or labels are not one for each motion.
+        """
+        if independent == "numbers":
+            return
+        motions = int(self.plan.owner[-1]) + 1
+        if not isinstance(independent, str) and len(independent) != motions:
+            raise ValueError(
+                f"options.independent must be one label for each of {motions} motions, got {len(independent)}"
+            )
+        count, least = len(np.unique(self._labels(independent))), len(self.space.start) + 2
+        if count < least:
+            what = independent if isinstance(independent, str) else "labels"
+            raise ValueError(
+                f"options.independent needs at least {least} {what}, two more than there are parameters, got"
+                f" {count}"
+            )
+
+    def _labels(self, independent: str | Sequence[str]) -> np.ndarray:
+        """Of each window, what it shares errors with."""
+        if independent == "windows":
+            return np.arange(len(self.plan.rows))
+        return self.plan.owner if independent == "motions" else np.array(independent)[self.plan.owner]
+
     def begin_near(self, after: Identification) -> None:
         """Begin where an earlier fit left what it estimated of the windows' states, if this one does too."""
         self._near = True
@@ -189,10 +217,23 @@ class Problem:
 
     def assembled(self, found: Linearized) -> NormalEquations:
         """Normal equations of a simulation of all windows."""
-        loss, gradient, hessian, jump, slope = (np.asarray(v, float) for v in found[:5])
+        return self._assembled(*(np.asarray(v, float) for v in found[:5]), owner=self.plan.owner)
+
+    def groups(self, found: Linearized, independent: str | Sequence[str]) -> Groups:
+        """What each independent group of a simulation says of the parameters; see `IdentifyOptions`."""
+        labels = self._labels(independent)
+        arrays = [np.asarray(v, float) for v in found[:5]]
+        parts = []
+        for label in np.unique(labels):
+            mine = labels == label
+            _, owner = np.unique(self.plan.owner[mine], return_inverse=True)
+            parts.append(eliminated(self._assembled(*(v[mine] for v in arrays), owner=owner)))
+        return Groups(np.array([g for g, _ in parts]), np.array([h for _, h in parts]))
+
+    def _assembled(self, loss, gradient, hessian, jump, slope, *, owner: np.ndarray) -> NormalEquations:
         p, k = len(self.space.start), self.private
         if self.model.jumps is not None:
-            return chained(p, k, self.plan.owner, self.model.jumps, loss, gradient, hessian, jump, slope)
+            return chained(p, k, owner, self.model.jumps, loss, gradient, hessian, jump, slope)
         return NormalEquations(
             float(loss.sum()),
             gradient[:, :p].sum(axis=0),

@@ -67,7 +67,8 @@ class Identification:
         smoothed: Whether the loss is rough and the values are where its trend is least; standard errors then
             hold its ripples.
         worth: What derivatives of the loss are worth there, if it is rough or no step reduces it; else None.
-        freedom: Observed numbers less estimated ones.
+        freedom: Observed numbers less estimated ones; of windows or motions that are independent
+            (`IdentifyOptions.independent`) their number less one.
         evaluations: How often all windows were simulated, with derivatives.
         seconds: Time it took [s], compilation included.
         masses: Mass [kg] and its standard error of bodies whose `mass_scale` was found, by name.

@@ -27,6 +27,8 @@ _MOST_STARTS = 10_000
 
 _JACOBIANS = ("auto", "forward", "reverse")
 
+INDEPENDENT = ("numbers", "windows", "motions")
+
 _NOISE = (*QUANTITIES, "q")
 
 _INITIAL = {"given": (), "velocities": ("velocity", "omega"), "states": tuple(QUANTITIES)}
@@ -42,6 +44,10 @@ class IdentifyOptions:
             with one after the other. Needs `window`, and all of the initial states to be estimated
             (`initial="states"`). None: any gap.
         huber: Length of a residual, in standard deviations, from which it counts linearly; None: never.
+        independent: Between what errors are independent: "numbers" (all that were observed), "windows" or
+            "motions", or a label for each motion: those of one label share errors, as pieces of one recording
+            do. Within these they may then be anything, such as those of a law that is a little wrong, and
+            standard errors come from how far these pull the parameters apart.
         smooth: Whether to go on by slopes over visible steps where the loss is rough: to the minimum of its
             trend, with standard errors that hold the ripples.
         starts: Points to start from: the scene's values, and others in the bounds. None: one, of one or two
@@ -58,6 +64,7 @@ class IdentifyOptions:
     window: int | None = None
     continuity: float | Sequence[float] | None = None
     huber: float | None = None
+    independent: str | Sequence[str] = "numbers"
     smooth: bool = True
     starts: int | None = None
     seed: int = 0
@@ -80,6 +87,14 @@ class IdentifyOptions:
             raise ValueError(f"continuity needs window, got continuity {self.continuity} and window None")
         if self.huber is not None:
             checked_number("huber", self.huber, above=0)
+        if isinstance(self.independent, str):
+            checked_choice("independent", self.independent, INDEPENDENT)
+        else:
+            checked_items("independent", self.independent, str)
+        if self.independent == "windows" and self.gaps:
+            raise ValueError(
+                "independent='windows' excludes continuity: windows that must meet are one motion"
+            )
         if self.starts is not None:
             checked_count("starts", self.starts, most=_MOST_STARTS)
         checked_count("seed", self.seed, least=0)

@@ -1,4 +1,9 @@
-"""How well the data determine the parameters: covariance, and what they leave open, in words."""
+"""How well the data determine the parameters: covariance, and what they leave open, in words.
+
+There are two covariances. One takes every observed number for independent. The other takes groups of numbers
+(motions, windows) for independent of each other, whatever the errors within a group are: Liang and Zeger,
+Longitudinal data analysis using generalized linear models, 1986.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,6 +25,26 @@ _UNSEEN = 10.0
 # Share of a combination that a parameter must have to be named.
 _TAKES_PART = 0.25
 _MASSES = (".mass", ".mass_scale", ".inertia")
+# Least share of the data on a combination of parameters that lies outside of a group: what one group alone
+# decides is almost infinitely uncertain.
+_OUTSIDE = 1e-3
+# Motions from which their scatter is compared with the standard errors, how many times these it must be to be
+# reported, and the probability at which chance alone does that.
+_ENOUGH_MOTIONS, _SCATTERED, _BY_CHANCE = 8, 2.0, 1e-4
+
+
+class Groups(NamedTuple):
+    """What each group of residuals says of the coordinates alone, initial states eliminated.
+
+    The groups are independent of each other.
+    """
+
+    gradients: np.ndarray  # Of the loss of each group, where that of all is least, shape (m, p)
+    hessians: np.ndarray  # Shape (m, p, p); their sum is that of all
+
+    def of(self, coordinates: np.ndarray) -> "Groups":
+        """Of some of the coordinates; the others are held."""
+        return Groups(self.gradients[:, coordinates], self.hessians[:, coordinates[:, None], coordinates])
 
 
 class Uncertainty(NamedTuple):
@@ -28,7 +53,7 @@ class Uncertainty(NamedTuple):
     # Of the coordinates, shape (p, p); ∞ on the diagonal where the data say nothing, NaN for what lies on a
     # bound.
     covariance: np.ndarray
-    freedom: int  # Observed numbers less estimated ones
+    freedom: int  # Observed numbers less estimated ones; of groups their number less one
     messages: tuple[str, ...]  # Sentences about what is not determined
 
 
@@ -42,6 +67,7 @@ def uncertainty(
     scene: Scene,
     ripple: np.ndarray | None = None,
     least: float = 0.0,
+    groups: Groups | None = None,
 ) -> Uncertainty:
     """Covariance s² (JᵀWJ)⁻¹ of the coordinates, initial states eliminated.
 
@@ -59,6 +85,8 @@ def uncertainty(
         scene: The scene at the start, for the words.
         ripple: Covariance of the coordinates that a rough loss adds, shape (p, p); default none.
         least: Least s²; 1 where residuals are smaller because frames share what they are off by.
+        groups: Groups of residuals that are independent of each other; None: every number is. With groups the
+            covariance is `between_groups`.
     """
     p = len(x)
     _, hessian = eliminated(normal)
@@ -74,6 +102,8 @@ def uncertainty(
         # The normal equations have weights that average to about `inside`: one of its two factors.
         variance = share**2 * clipped / max(freedom, 1) / max(inside, 1e-3)
     variance = max(variance, least)
+    if groups is not None:
+        freedom = len(groups.gradients) - 1
     covariance = np.full((p, p), np.nan)
     free = np.flatnonzero(~on_bound)
     messages = [
@@ -83,10 +113,62 @@ def uncertainty(
     ]
     if len(free):
         rough = np.zeros((len(free), len(free))) if ripple is None else ripple[np.ix_(free, free)]
-        found, more = _inverse(space, x, hessian[np.ix_(free, free)], variance, free, scene, freedom, rough)
+        mine = None if groups is None else groups.of(free)
+        curvature = hessian[np.ix_(free, free)]
+        found, more = _inverse(space, x, curvature, variance, free, scene, freedom, rough, mine)
         covariance[np.ix_(free, free)] = found
         messages += more
     return Uncertainty(covariance, freedom, tuple(messages))
+
+
+def between_groups(hessian: np.ndarray, groups: Groups) -> np.ndarray:
+    """Covariance of the least squares estimate from how far groups of residuals pull it apart, shape (p, p).
+
+    H⁻¹ (Σ g̃ g̃ᵀ) H⁻¹ (m − 1)/m with g̃ = (I − H_c H⁻¹)⁻¹ g of each group c. That is the jackknife by groups of
+    the linearised problem: H⁻¹ g̃ is how far the estimate moves when the group is left out (Bell and
+    McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples, 2002).
+    Directions without data have no variance here.
+
+    Args:
+        hessian: Of the loss of all groups, positive semidefinite, in units in which its numbers compare.
+        groups: The groups, in the same units.
+    """
+    values, vectors = np.linalg.eigh(hessian)
+    known = values > _FLAT * max(float(values[-1]), np.finfo(float).tiny)
+    root = vectors[:, known] / np.sqrt(values[known])
+    moves = []
+    for gradient, own in zip(groups.gradients @ root, root.T @ groups.hessians @ root, strict=True):
+        outside, axes = np.linalg.eigh(np.eye(len(own)) - own)
+        moves.append(root @ (axes @ ((axes.T @ gradient) / np.maximum(outside, _OUTSIDE))))
+    found = np.array(moves)
+    return found.T @ found * (len(found) - 1) / len(found)
+
+
+def scattered(
+    labels: Sequence[str], found: np.ndarray, between: np.ndarray, n_motions: int
+) -> tuple[str, ...]:
+    """Sentences about coordinates that motions pull apart further than their standard errors say.
+
+    Args:
+        labels: Names of the coordinates.
+        found: Their covariance, if every observed number is independent.
+        between: The same, if only motions are.
+        n_motions: How many there are; few say nothing.
+    """
+    from scipy.stats import chi2
+
+    if n_motions < _ENOUGH_MOTIONS:
+        return ()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        times = np.sqrt(np.diag(between) / np.diag(found))
+    least = np.sqrt(chi2.isf(_BY_CHANCE, n_motions - 1) / (n_motions - 1))
+    # NaN, of what lies on a bound or is not observed, compares as false.
+    return tuple(
+        f"{label}: motions pull it apart by {each:.2g} times its standard error, which takes errors of frames"
+        " for independent; independent='motions' of IdentifyOptions takes motions for that"
+        for label, each in zip(labels, times, strict=True)
+        if np.isfinite(each) and each > max(least, _SCATTERED)
+    )
 
 
 def quantile(level: float, freedom: int) -> float:
@@ -106,14 +188,30 @@ def _private(normal: NormalEquations) -> int:
     return int(np.sum(values > 1e-9))
 
 
-def _inverse(space: Space, x, hessian, variance: float, free, scene: Scene, freedom: int, rough):
+def _inverse(
+    space: Space,
+    x,
+    hessian,
+    variance: float,
+    free,
+    scene: Scene,
+    freedom: int,
+    rough,
+    groups: Groups | None,
+):
     width = space.upper[free] - space.lower[free]
     span = np.where(np.isfinite(width), width, np.maximum(np.abs(x[free]), 1e-3))
     # In shares of each parameter's range, so that units do not decide what is flat.
-    values, vectors = np.linalg.eigh(hessian * span[:, None] * span[None])
+    squares = span[:, None] * span[None]
+    values, vectors = np.linalg.eigh(hessian * squares)
     flat = values <= _FLAT * max(float(values[-1]), np.finfo(float).tiny)
-    inverse = np.where(flat, 0.0, variance / np.where(flat, 1.0, values))
-    covariance = (vectors * inverse) @ vectors.T + rough / (span[:, None] * span[None])
+    if groups is None:
+        inverse = np.where(flat, 0.0, variance / np.where(flat, 1.0, values))
+        covariance = (vectors * inverse) @ vectors.T
+    else:
+        scaled = Groups(groups.gradients * span, groups.hessians * squares)
+        covariance = between_groups(hessian * squares, scaled)
+    covariance = covariance + rough / squares
     messages = []
     for k in np.flatnonzero(flat):
         messages.append(_words(space, free, vectors[:, k], scene))
@@ -131,7 +229,7 @@ def _inverse(space: Space, x, hessian, variance: float, free, scene: Scene, free
         )
         if said is not None:
             messages.append(f"{space.labels[i]} is hardly determined: {said}")
-    return covariance * span[:, None] * span[None], messages
+    return covariance * squares, messages
 
 
 def _width(x: float, error: float, lower: float, upper: float, logarithm: bool, freedom: int) -> str | None:

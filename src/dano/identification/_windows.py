@@ -1,6 +1,7 @@
 """Motions cut into windows, each simulated from its own initial state, as arrays to map over."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,6 +23,10 @@ from dano.maths import quat_rotate
 from dano.scene import Control, Layout, Scene, State
 
 _CONFIGURATION = ("position", "orientation")
+
+# Acceleration [m/s²] of a body, or of its surface by a change of spin, from which velocities of neighbouring
+# frames are taken to have an impact between them: five times that of free fall.
+_IMPACT = 50.0
 
 
 class Windows(eqx.Module):
@@ -112,6 +117,7 @@ def plan_windows(
         what = f"motion {number}" if len(motions) > 1 else "the motion"
         full = _on_all_bodies(scene, motion, what)
         pieces += _cut(scene, motion, full, state, control, number, window, smoothing, what)
+    _report_impacts(scene, pieces, initial)
     moving = [i for i, body in enumerate(scene.bodies) if not body.fixed]
     seen = [i for i in moving if any(scene.names[i] in motion.names for motion in motions)]
     if not seen:
@@ -288,7 +294,7 @@ def _cut(
         first += int(ready[0])
         last = n if window is None else min(first + window, n)
         if last - first >= 2:
-            start = _initial(scene, motion, full, smooth, state, first, h, what, origins)
+            start, struck = _initial(scene, motion, full, smooth, state, first, h, what, origins)
             pieces.append(
                 {
                     "owner": number,
@@ -298,6 +304,7 @@ def _cut(
                     "origin": motion.times[0],
                     "origins": origins,
                     "start": start,
+                    "struck": struck,
                     "control": control,
                     "q": _joints_on_all_bodies(scene, motion, first, last),
                     "covariance": _covariance_on_all_bodies(scene, motion, first, last),
@@ -334,8 +341,11 @@ def _says_where(scene, motion, full, has_state: bool, moving) -> np.ndarray:
 
 
 def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str, origins):
-    """Initial state of the window that begins at a frame, as a dict of arrays (n, ·)."""
-    start = {}
+    """Initial state of the window that begins at a frame, as a dict of arrays (n, ·).
+
+    And which measured velocities of bodies, shape (n,), have an impact beside them.
+    """
+    start, struck = {}, {}
     unseen = [i for i, body in enumerate(scene.bodies) if not body.fixed and body.name not in motion.names]
     if unseen and first > 0:
         raise ValueError(
@@ -349,11 +359,17 @@ def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str
                 value[:, 0] = 1.0
         else:
             value = np.array(getattr(state, key), dtype=float)
-        found = full[key][first] if key in _CONFIGURATION else _earlier(motion, smooth[key], first, h)
+        if key in _CONFIGURATION:
+            found = full[key][first]
+        else:
+            found, struck[key] = _earlier(scene, motion, key, smooth[key], first, h)
+            struck[key] &= np.isfinite(full[key][first]).all(axis=-1)
         known = np.isfinite(found).all(axis=-1)
         value[known] = found[known]
         start[key] = value
-    return {**start, **_joint_start(scene, motion, start, state, first, origins)} if scene.joints else start
+    if scene.joints:
+        start |= _joint_start(scene, motion, start, state, first, origins)
+    return start, struck
 
 
 def _joint_start(scene, motion, start, state, first: int, origins) -> dict[str, np.ndarray]:
@@ -381,14 +397,55 @@ def _joint_start(scene, motion, start, state, first: int, origins) -> dict[str, 
     return {"q": q, "v": v}
 
 
-def _earlier(motion: Motion, values: np.ndarray, first: int, h: float) -> np.ndarray:
-    """Velocities half a step before a frame, which is where the rollout has them, from the frames around."""
+def _earlier(
+    scene, motion: Motion, key: str, values: np.ndarray, first: int, h: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities half a step before a frame, which is where the rollout has them, from the frames around.
+
+    A slope over an impact does not count; that of the frames on the side to which the velocity is moved does.
+    And where these have one between them, or are not there, the velocity stays that of its frame: the second
+    array, shape (n,), says of which bodies.
+    """
     shift = motion.lag - 0.5 * h
-    neighbours = range(max(first - 1, 0), min(first + 2, len(values)))
-    low, high = neighbours[0], neighbours[-1]
-    slope = (values[high] - values[low]) / (motion.times[high] - motion.times[low])
-    moved = values[first] + shift * slope
-    return np.where(np.isfinite(moved), moved, values[first])
+    last = len(values) - 1
+    around = _slope(motion, values, max(first - 1, 0), min(first + 1, last))
+    beside = _slope(motion, values, *((first - 1, first) if shift < 0 else (first, first + 1)))
+    half = 0.5 * np.array([body.size if np.isfinite(body.size) else 0.0 for body in scene.bodies])
+    reach = np.ones(len(scene.bodies)) if key == "velocity" else half
+    struck = _IMPACT < np.linalg.norm(around, axis=-1) * reach
+    # Not a number compares as false: without frames on that side there is no slope.
+    smooth = np.linalg.norm(beside, axis=-1) * reach <= _IMPACT
+    change = np.where(struck[:, None], np.where(smooth[:, None], beside, 0.0), around)
+    moved = values[first] + shift * change
+    return np.where(np.isfinite(moved), moved, values[first]), struck & ~smooth & (shift != 0)
+
+
+def _slope(motion: Motion, values: np.ndarray, low: int, high: int) -> np.ndarray:
+    """Change of values a second from one frame to another; not a number beyond the first and last frame."""
+    if low < 0 or high >= len(values) or low == high:
+        return np.full(values.shape[1:], np.nan)
+    return (values[high] - values[low]) / (motion.times[high] - motion.times[low])
+
+
+def _report_impacts(scene: Scene, pieces: list[dict], initial: Sequence[str]) -> None:
+    """Report bodies whose measured first velocities are not known half a step before their frame."""
+    for key in ("velocity", "omega"):
+        if key in initial:
+            continue
+        struck = np.array([piece["struck"][key] for piece in pieces])
+        if not struck.any():
+            continue
+        body = scene.names[int(np.flatnonzero(struck.any(axis=0))[0])]
+        count = int(struck.any(axis=1).sum())
+        where = f"{count} of {len(pieces)} windows" if len(pieces) > 1 else "the motion"
+        warnings.warn(
+            f"{key} of {body!r} changes beside the frame in which it begins as by an impact, in {where}: the"
+            " simulation needs it half a step before that frame, and takes it as it is there."
+            " Motion.create(lag=…) says when velocities were measured, half a timestep before frames in a"
+            " simulation; initial='velocities' estimates them",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def _steps_to(elapsed: float, h: float) -> int:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from dano.building import BuildOptions
 from dano.checks import checked_items, checked_kind, checked_number, checked_path, shown
@@ -292,9 +293,15 @@ def _joined(shapes: Sequence[AbstractShape]) -> AbstractShape:
     y, z = (origin[k] + spacing * np.arange(counts[k]) for k in (1, 2))
     for i in range(counts[0]):
         plane = np.stack(np.meshgrid([origin[0] + spacing * i], y, z, indexing="ij")).reshape(3, -1)
-        each = [np.asarray(shape.sdf_jet(jnp.asarray(plane), 0)) for shape in shapes]
+        each = [np.asarray(_distances(shape, jnp.asarray(plane))) for shape in shapes]
         distances[i] = np.min(each, axis=0).reshape(counts[1:])
     return SignedDistanceGrid(distances, origin, spacing)
+
+
+@eqx.filter_jit
+def _distances(shape: AbstractShape, points: Array) -> Array:
+    """Compiled once for a part: uncompiled, each plane of points would compile its loop over them anew."""
+    return shape.sdf_jet(points, 0)
 
 
 def _weight(part: Part, shape: AbstractShape, options: BuildOptions) -> _Weight:

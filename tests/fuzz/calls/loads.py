@@ -8,7 +8,7 @@ import dano
 from dano.building import BuildOptions
 from tests.fuzz import kinds
 from tests.fuzz.calls.call import Call
-from tests.fuzz.kinds import array, CHOICE, instance, LIST, OPTIONAL_POSITIVE
+from tests.fuzz.kinds import array, CHOICE, instance, LIST, NAME, OPTIONAL_POSITIVE
 from tests.fuzz.world import World
 
 
@@ -54,7 +54,13 @@ def _wrist(w: World) -> Iterator[Call]:
     bad["position"] = {k: v for k, v in _rows(n, 3).items() if k != "nothing"}
     yield Call("WristLog.create", dano.WristLog.create, good, {**bad, "frame": CHOICE})
     log = dano.WristLog.create(**good)
-    yield Call("identify_load", dano.identify_load, {"log": log}, {"log": instance(), "gravity": array(3)})
+    shapes = {k: v for k, v in _rows(20, 3).items() if k != "nothing"}
+    yield Call(
+        "identify_load",
+        dano.identify_load,
+        {"log": log},
+        {"log": instance(), "gravity": array(3), "shape": {**shapes, "short": np.zeros((2, 3))}},
+    )
     names = "time,qw,qx,qy,qz,fx,fy,fz,mx,my,mz"
     table = np.column_stack([np.reshape(value, (n, -1)) for value in good.values()])
     path = w.folder / "wrist.csv"
@@ -68,4 +74,27 @@ def _wrist(w: World) -> Iterator[Call]:
     )
 
 
-PARTS = (_parts, _wrist)
+def _arm(w: World) -> Iterator[Call]:
+    n = 80
+    good = {"times": 0.01 * np.arange(n), "q": np.zeros((n, 1)), "torque": np.zeros((n, 1))}
+    bad = {key: _rows(n, 1) for key in ("q", "torque")}
+    bad["times"] = {"falling": good["times"][::-1], "few": good["times"][:3], "text": "t", "nothing": None}
+    yield Call("JointLog.create", dano.JointLog.create, good, bad)
+    arm = dano.Scene.create(
+        [dano.Body("link", dano.Capsule(0.03, 0.2), mass=1.0)],
+        joints=[dano.Joint(None, "link", "hinge", axis=(0, 1, 0))],
+    )
+    yield Call(
+        "identify_load_on_arm",
+        dano.identify_load_on_arm,
+        {"log": dano.JointLog.create(**good), "scene": arm, "body": "link"},
+        {
+            "log": instance(),
+            "scene": instance(),
+            "body": NAME,
+            "shape": {"text": "s", "short": np.zeros((2, 3))},
+        },
+    )
+
+
+PARTS = (_parts, _wrist, _arm)

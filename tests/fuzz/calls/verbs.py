@@ -177,6 +177,7 @@ def _identify(w: World) -> Iterator[Call]:
                 "deep": [[0.3, 0.1]],
             },
             "huber": OPTIONAL_POSITIVE,
+            "independent": {**CHOICE, "numbers": [1, 2]},
             "starts": {**COUNT, "too many": 10**6},
             "seed": {"share": 2.5, "text": "a", "negative": -1},
             "max_iterations": COUNT,

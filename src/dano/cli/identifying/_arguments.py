@@ -30,6 +30,7 @@ class Identify:
         position_noise: Standard deviation of observed positions [m].
         rotation_noise: Standard deviation of observed orientations [rad].
         huber: Number of standard deviations beyond which residuals count linearly.
+        independent: Between what errors are independent: all observed numbers, windows, or motions.
         window: Cut motions into windows of this many frames; default: do not cut.
         continuity: Allowed gap between a window's end and the next one's start, in standard deviations;
             default: any.
@@ -61,6 +62,7 @@ class Identify:
     position_noise: float | None = None
     rotation_noise: float | None = None
     huber: float | None = None
+    independent: Literal["numbers", "windows", "motions"] = "numbers"
     window: int | None = None
     continuity: float | None = None
     starts: int | None = None

@@ -133,6 +133,7 @@ def _options(command: Identify, kept: Path | None) -> IdentifyOptions:
         window=command.window,
         continuity=command.continuity,
         huber=command.huber,
+        independent=command.independent,
         starts=command.starts,
         checkpoint=kept if command.video is None else None,
         resume=command.resume,

@@ -134,6 +134,42 @@ class Twists(NamedTuple):
     alpha: np.ndarray  # Its rate [rad/s², S]
 
 
+class Surroundings(NamedTuple):
+    """Rows around each row, and what makes polynomials in time of values there."""
+
+    middle: np.ndarray  # Rows, shape (n,)
+    near: np.ndarray  # Rows around each, shape (n, m)
+    inverse: np.ndarray  # Values at the rows around to coefficients, times over the scale, shape (n, d, m)
+    scale: float  # [s]
+
+
+def surroundings(times: np.ndarray, known: np.ndarray) -> Surroundings:
+    """Where polynomials can be put through rows around a row.
+
+    Args:
+        times: [s], shape (T,).
+        known: Which rows have all that is needed, shape (T,).
+
+    Raises:
+        ValueError: If there are too few rows.
+    """
+    step = float(np.median(np.diff(times)))
+    half = int(np.clip(round(_SMOOTHED / step), _DEGREE, 25))
+    middle = np.arange(half, len(times) - half)
+    near = middle[:, None] + np.arange(-half, half + 1)
+    # A gap in time is no motion to fit a polynomial to.
+    span = times[near[:, -1]] - times[near[:, 0]] if len(near) else np.zeros(0)
+    good = known[near].all(axis=1) & (span < 3 * 2 * half * step)
+    middle, near = middle[good], near[good]
+    if len(middle) < _LEAST:
+        raise ValueError(
+            f"the log must have {_LEAST} rows with all readings, each with {half} such rows before and after"
+            f" it, got {len(middle)}"
+        )
+    tau = (times[near] - times[middle][:, None]) / (half * step)
+    return Surroundings(middle, near, np.linalg.pinv(tau[..., None] ** np.arange(_DEGREE + 1)), half * step)
+
+
 def twists(log: WristLog) -> Twists:
     """Accelerations and spins, from polynomials through the poses around each row.
 
@@ -142,31 +178,13 @@ def twists(log: WristLog) -> Twists:
     Raises:
         ValueError: If too few rows have poses, or accelerations are those of other units.
     """
-    step = float(np.median(np.diff(log.times)))
-    half = int(np.clip(round(_SMOOTHED / step), _DEGREE, 25))
     given = np.column_stack([log.position, log.orientation, log.force, log.torque])
-    whole = np.atleast_1d(np.isfinite(given).all(axis=1))
-    middle = np.arange(half, len(log.times) - half)
-    near = middle[:, None] + np.arange(-half, half + 1)
-    # A gap in time is no motion to fit a polynomial to.
-    span = log.times[near[:, -1]] - log.times[near[:, 0]] if len(near) else np.zeros(0)
-    good = whole[near].all(axis=1) & (span < 3 * 2 * half * step)
-    middle, near = middle[good], near[good]
-    if len(middle) < _LEAST:
-        raise ValueError(
-            f"the log must have {_LEAST} rows with poses, forces and torques, each with {half} such rows"
-            f" before"
-            f" and after it, got {len(middle)}"
-        )
-    tau = (log.times[near] - log.times[middle][:, None]) / (half * step)
-    powers = tau[..., None] ** np.arange(_DEGREE + 1)
-    inverse = np.linalg.pinv(powers)
+    middle, near, inverse, scale = surroundings(log.times, np.atleast_1d(np.isfinite(given).all(axis=1)))
     turns = log.orientation[middle]
     relative = quat_multiply(quat_conjugate(turns)[:, None], log.orientation[near])
     vectors = np.asarray(quat_log(relative))
     along = inverse @ log.position[near]
     around = inverse @ vectors
-    scale = half * step
     acceleration = 2 * along[:, 2] / scale**2
     if (typical := float(np.median(np.linalg.norm(acceleration, axis=1)))) > _JUMP:
         raise ValueError(

@@ -1,0 +1,321 @@
+"""The least squares from which mass, centre and inertia of a load come, whatever was read."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dano.identification.wrench._log import Twists
+from dano.identification.wrench._shape import about_centre, matrix_of, of_a_body, within_shape
+from dano.maths import quat_conjugate, quat_rotate
+from dano.objects import MassProperties
+
+_PASSES = 4
+"""Passes of weighted least squares: noise of each kind of reading from the residuals of the pass before."""
+
+_NULL = 1e-9
+"""Share of the largest curvature below which a direction is not determined at all."""
+
+UNSURE = 0.25
+"""Standard error, as a share of the value, from which a value is not observed."""
+
+_SURE = 1.96
+"""Standard errors of a 95 % interval."""
+
+STRONG = 40.0
+"""Fall of χ² from which a drift or a slip is believed: 6 numbers without meaning fall it by 6 ± 3.5."""
+
+_SLIP, _SLIPS = 5e-4, 11
+"""Least way of a centre of mass that counts as a slip [m]; moments at which one is looked for."""
+
+_OUTSIDE = 4.0
+"""Standard errors by which a centre of mass may lie outside of a given shape."""
+
+_NAMES = ("mass", "centre", "inertia")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Load:
+    """What a sensor, or the last link of an arm, holds, in its frame S. NaN: not observed.
+
+    Attributes:
+        mass: [kg].
+        centre: Of mass [m, S], shape (3,).
+        inertia: About the centre of mass [kg m², axes of S], shape (3, 3).
+        standard_errors: Of these three, by name, in the same shapes; infinite where not observed.
+        force_bias: What the sensor shows without a load [N, S], at the middle of the log.
+        torque_bias: The same [N m, S].
+        drift: How much both change over the whole log [N, N m], shape (6,); zeros where they do not.
+        force_noise: Standard deviation of a force [N].
+        torque_noise: Of a torque [N m].
+        joint_bias: Constant part of the torques of an arm's joints [N m], shape (k,); None for the log of a
+            wrist, as are the next two. What belongs to a wrist is NaN for an arm.
+        joint_friction: Of each joint: Coulomb's [N m] and viscous [N m s/rad], shape (k, 2).
+        joint_noise: Standard deviation of each joint's torque [N m], shape (k,).
+        unobserved: Which of mass, centre, inertia the log cannot decide.
+        messages: What was found odd or corrected, in words.
+    """
+
+    mass: float
+    centre: np.ndarray
+    inertia: np.ndarray
+    standard_errors: dict[str, np.ndarray]
+    force_bias: np.ndarray
+    torque_bias: np.ndarray
+    drift: np.ndarray
+    force_noise: float
+    torque_noise: float
+    unobserved: tuple[str, ...]
+    messages: tuple[str, ...]
+    joint_bias: np.ndarray | None = None
+    joint_friction: np.ndarray | None = None
+    joint_noise: np.ndarray | None = None
+
+    def interval(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """95 % interval of "mass", "centre" or "inertia", number by number.
+
+        Raises:
+            ValueError: If there is no such quantity.
+        """
+        if name not in _NAMES:
+            raise ValueError(f"name must be one of {list(_NAMES)}, got {name!r}")
+        value, error = np.asarray(getattr(self, name)), np.asarray(self.standard_errors[name])
+        return value - _SURE * error, value + _SURE * error
+
+    def properties(self) -> MassProperties:
+        """Mass properties in the sensor's frame, as objects have them.
+
+        Raises:
+            ValueError: If something was not observed.
+        """
+        if self.unobserved:
+            raise ValueError(f"the log does not decide {' and '.join(self.unobserved)} of the load")
+        return MassProperties(
+            self.mass,
+            self.centre,
+            self.inertia,
+            mass_error=self.standard_errors["mass"],
+            com_error=self.standard_errors["centre"],
+            inertia_error=self.standard_errors["inertia"],
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rows:
+    """The linear model: readings (n, r) at times from −½ to ½, and their derivatives (n, r, p).
+
+    The first ten columns are those of mass, first moments and inertia. Readings of one kind, shape (r,),
+    share a noise.
+    """
+
+    times: np.ndarray
+    readings: np.ndarray
+    table: np.ndarray
+    kinds: np.ndarray
+
+    def beside(self, columns: np.ndarray) -> "Rows":
+        """With further columns, shape (n, r, k)."""
+        return dataclasses.replace(self, table=np.concatenate([self.table, columns], axis=2))
+
+
+def shares(times: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Times of some rows of a log, from −½ at its beginning to ½ at its end."""
+    return (times[rows] - 0.5 * (times[0] + times[-1])) / (times[-1] - times[0])
+
+
+def wrench_table(moved: Twists, gravity: np.ndarray) -> np.ndarray:
+    """Derivatives of force and torque by mass, first moments and inertia, in axes of S, shape (n, 6, 10)."""
+    count = len(moved.rows)
+    down = np.asarray(quat_rotate(quat_conjugate(moved.turn), np.broadcast_to(gravity, (count, 3))))
+    felt = moved.acceleration - down
+    spin, rate = _cross(moved.omega), _cross(moved.alpha)
+    table = np.zeros((count, 6, 10))
+    table[:, :3, 0] = felt
+    table[:, :3, 1:4] = rate + spin @ spin
+    table[:, 3:, 1:4] = -_cross(felt)
+    table[:, 3:, 4:10] = _inertial(moved.alpha) + spin @ _inertial(moved.omega)
+    return table
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """Where weighted least squares ended: θ, its covariance, directions without data, noise, χ²."""
+
+    theta: np.ndarray
+    covariance: np.ndarray
+    null: np.ndarray
+    noise: np.ndarray
+    chi2: float
+    inflation: float
+
+
+def fitted(rows: Rows, noise: np.ndarray | None = None) -> Fit:
+    """Least squares with weights from the residuals, or from a noise that is known."""
+    n, _, p = rows.table.shape
+    counts = np.bincount(rows.kinds)
+    sigma = np.ones(len(counts)) if noise is None else noise
+    theta = covariance = null = residuals = np.zeros(0)
+    for _ in range(_PASSES if noise is None else 1):
+        weight = 1 / sigma[rows.kinds]
+        table = (rows.table * weight[None, :, None]).reshape(-1, p)
+        target = (rows.readings * weight).ravel()
+        scale = np.linalg.norm(table, axis=0)
+        # What nothing depends on is a direction without data, not a division by zero.
+        scale[scale < 1e-150] = 1.0
+        values, vectors = np.linalg.eigh((table / scale).T @ (table / scale))
+        known = values > _NULL * values.max()
+        inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
+        covariance = inverse / np.outer(scale, scale)
+        theta = covariance @ (table.T @ target)
+        null = np.linalg.norm(vectors[:, ~known], axis=1)
+        residuals = rows.readings - rows.table @ theta
+        if noise is None:
+            free = np.maximum(n * counts - p / len(counts), 1.0)
+            sums = np.bincount(rows.kinds, np.sum(residuals**2, axis=0))
+            sigma = np.maximum(np.sqrt(sums / free), 1e-12)
+    chi2 = float(np.sum((residuals / sigma[rows.kinds]) ** 2))
+    return Fit(theta, covariance, null, sigma, chi2, _inflation(residuals))
+
+
+def _inflation(residuals: np.ndarray) -> float:
+    """By how much neighbouring rows are no news: (1 + ρ)/(1 − ρ) of their correlation, at least 1."""
+    above, below = residuals[1:].ravel(), residuals[:-1].ravel()
+    correlation = float(np.sum(above * below) / max(np.sum(residuals**2), 1e-300))
+    correlation = min(max(correlation, 0.0), 0.98)
+    return (1 + correlation) / (1 - correlation)
+
+
+def check_slip(rows: Rows, fit: Fit, times: np.ndarray) -> None:
+    """Refuse a load that slips.
+
+    Args:
+        rows: The model.
+        fit: Its fit.
+        times: Of the log [s].
+
+    Raises:
+        ValueError: If its centre of mass moves in the gripper.
+    """
+    best, when, shift = 0.0, 0.0, np.zeros(3)
+    for moment in np.linspace(-0.4, 0.4, _SLIPS):
+        later = (rows.times > moment)[:, None, None]
+        split = fitted(rows.beside(later * rows.table[:, :, 1:10]), fit.noise)
+        fall = (fit.chi2 - split.chi2) / split.inflation
+        if fall > best:
+            best, when, shift = fall, moment, split.theta[-9:-6] / fit.theta[0]
+    if best > STRONG and (way := float(np.linalg.norm(shift))) > _SLIP:
+        at = 0.5 * (times[0] + times[-1]) + when * (times[-1] - times[0])
+        raise ValueError(
+            f"the load must be held fast: its centre of mass moves by {1e3 * way:.2g} mm in the gripper"
+            f" at about {at:.3g} s; take the part of the log before or after it (log.part)"
+        )
+
+
+def load_of(
+    fit: Fit, messages: list[str], bodies: np.ndarray | None, sensor: Callable[[np.ndarray], dict[str, Any]]
+) -> Load:
+    """Values, errors, and what is not observed.
+
+    Args:
+        fit: The fit.
+        messages: What was found so far.
+        bodies: Of `point_masses`; None: the shape is not known.
+        sensor: What further numbers of θ say, as fields of `Load`.
+    """
+    theta = fit.theta
+    covariance = fit.inflation * fit.covariance
+    values, jacobian = about_centre(theta[:10]), _slopes(theta[:10])
+    errors = np.sqrt(np.diagonal(jacobian @ covariance[:10, :10] @ jacobian.T))
+    if bodies is not None and fit.null[:4].max() < 1e-3:
+        _check_within(values, errors, bodies)
+        if fit.null[:10].max() < 1e-3:
+            best, errors = within_shape(theta[:10], covariance[:10, :10], bodies)
+            theta, values = _following(theta, covariance, best), about_centre(best)
+    lost = _lost(fit, values, errors)
+    if not any(lost.values()) and bodies is None:
+        likely = of_a_body(theta[:10], covariance[:10, :10])
+        if likely is not None:
+            theta, values = _following(theta, covariance, likely), about_centre(likely)
+            messages.append(
+                "the least squares are those of no body: the likeliest inertia that a body can have is given"
+            )
+    mass, centre, inertia = values[0], values[1:4], matrix_of(values[4:])
+    unobserved = tuple(name for name in _NAMES if lost[name])
+    if unobserved:
+        messages.append(
+            f"not observed: {', '.join(unobserved)}; turn the sensor about two axes for mass and centre,"
+            " and shake the load about three for its inertia"
+        )
+    found = {"mass": np.asarray(mass), "centre": centre, "inertia": inertia}
+    spread = {"mass": errors[0], "centre": errors[1:4], "inertia": matrix_of(errors[4:])}
+    for name in unobserved:
+        found[name] = np.full_like(found[name], np.nan)
+        spread[name] = np.full_like(spread[name], np.inf)
+    return Load(
+        mass=float(found["mass"]),
+        centre=found["centre"],
+        inertia=found["inertia"],
+        standard_errors={name: np.asarray(value) for name, value in spread.items()},
+        unobserved=unobserved,
+        messages=tuple(messages),
+        **sensor(theta),
+    )
+
+
+def _following(theta: np.ndarray, covariance: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """θ with other first ten numbers, the rest at its likeliest for these."""
+    follow = covariance[10:, :10] @ np.linalg.solve(covariance[:10, :10], best - theta[:10])
+    return np.concatenate([best, theta[10:] + follow])
+
+
+def _check_within(values: np.ndarray, errors: np.ndarray, bodies: np.ndarray) -> None:
+    """Refuse a shape that does not hold the centre of mass.
+
+    Raises:
+        ValueError: If it does not, by more than chance.
+    """
+    points = bodies[1:4].T
+    off = values[1:4] - np.clip(values[1:4], points.min(axis=0), points.max(axis=0))
+    if np.any(np.abs(off) > _OUTSIDE * errors[1:4] + 1e-3):
+        raise ValueError(
+            "shape must be points of the load in the sensor's frame, in metres: the log shows the centre of"
+            f" mass at {np.round(values[1:4], 4)} m, the points reach from {np.round(points.min(axis=0), 4)}"
+            f" to {np.round(points.max(axis=0), 4)} m"
+        )
+
+
+def _lost(fit: Fit, values: np.ndarray, errors: np.ndarray) -> dict[str, bool]:
+    """What is not observed: what no data depend on, and what is not known to a quarter of its size."""
+    mass, centre, trace = values[0], values[1:4], abs(values[4:7].sum())
+    size = max(np.linalg.norm(centre), np.sqrt(trace / 2 / max(mass, 1e-12)))
+    of_mass = fit.null[0] > 1e-3 or errors[0] > UNSURE * mass
+    of_centre = of_mass or fit.null[1:4].max() > 1e-3 or errors[1:4].max() > UNSURE * size
+    of_inertia = of_centre or fit.null[4:10].max() > 1e-3 or np.linalg.norm(errors[4:7]) > UNSURE * trace
+    return {"mass": bool(of_mass), "centre": bool(of_centre), "inertia": bool(of_inertia)}
+
+
+def _slopes(theta: np.ndarray) -> np.ndarray:
+    """Derivatives of `about_centre`, by central differences."""
+    found = np.empty((10, 10))
+    for k in range(10):
+        step = np.zeros(10)
+        step[k] = 1e-6 * max(abs(theta[k]), 1e-6)
+        found[:, k] = (about_centre(theta + step) - about_centre(theta - step)) / (2 * step[k])
+    return found
+
+
+def _inertial(vectors: np.ndarray) -> np.ndarray:
+    """What takes the six numbers of an inertia to its product with vectors, shape (n, 3, 6)."""
+    x, y, z = vectors.T
+    none = np.zeros_like(x)
+    rows = [[x, none, none, y, z, none], [none, y, none, x, none, z], [none, none, z, none, x, y]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _cross(vectors: np.ndarray) -> np.ndarray:
+    """What takes a vector to its product with vectors from the left, shape (n, 3, 3)."""
+    x, y, z = vectors.T
+    none = np.zeros_like(x)
+    rows = [[none, -z, y], [z, none, -x], [-y, x, none]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
