@@ -5,6 +5,7 @@ from collections.abc import Callable
 from benchmarks._measure import load_average, parse_arguments, parts_option, report, Row, rows_of_parts
 from benchmarks.contact import (
     _depth,
+    _discs,
     _dominoes,
     _overlaps,
     _rest,
@@ -21,6 +22,7 @@ PARTS: dict[str, Callable[..., list[Row]]] = {
     "depth": _depth.rows,
     "turning": _turning.rows,
     "rocking": _rocking.rows,
+    "discs": _discs.rows,
     "stacks": _stacks.rows,
     "dominoes": _dominoes.rows,
     "overlaps": _overlaps.rows,

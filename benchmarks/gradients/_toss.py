@@ -5,6 +5,7 @@ second: where it ends across the floor, by the vertical speed of the throw (Paul
 """
 
 import dataclasses
+import sys
 import time
 
 import jax
@@ -17,13 +18,13 @@ from benchmarks._measure import Row
 from benchmarks.gradients._families import mug
 from dano.scene_file import build_asset
 
-FRICTIONS = (0.1, 0.3, 1.0, 10.0)
+FRICTIONS = (0.1, 0.3, 1.0)
 TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4)  # [s]
 SPEEDS = (-3.0, -1.0)
 """Between which curves run [m/s]."""
 AT = -2.0
 """Where a value and a derivative are shown [m/s]."""
-STARTS, NEAR = 200, 0.1
+STARTS, NEAR = 60, 0.1
 FLAT = 1e-3
 """A derivative is near a slope within this, too [m/(m/s)]: slopes of plateaus are so small."""
 SHAPES = ("box", "bunny", "soap", "mug", "cylinder")
@@ -75,6 +76,7 @@ def _curve(
     near = 100 * np.mean(np.abs(g - slope) <= NEAR * np.abs(slope) + FLAT)
     largest = float(np.abs(g).max() / np.abs(slope).max())
     note = f"at −2 m/s: {float(at):.4f} m, derivative {float(slope_at):.4f}"
+    print(f"{group}: {right:.0f} %, {near:.0f} %, {largest:.3g}; {note}", file=sys.stderr, flush=True)
     size = f"largest slope {np.abs(slope).max():.2f}"
     return [
         Row(group, "derivatives with the sign of the slope", float(right), "%", targets[0], True, note=note),

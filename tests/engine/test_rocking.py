@@ -8,23 +8,27 @@ import pytest
 import dano
 
 FLOOR = dano.Body("floor", dano.HalfSpace(), fixed=True)
+TABLE = dano.Body("floor", dano.Box((0.5, 0.5, 0.05)), fixed=True)
 
 
-def kept(ratio, width, timestep, phases, made=lambda box: box):
+def kept(ratio, width, timestep, phases, made=lambda box: box, floor=FLOOR):
     """By what a landing multiplies the spin, from the heights of two swings, begun at several moments."""
     b, h, balance = width / 2, ratio * width / 2, np.arctan2(1, ratio)
     mass = 8000 * b * b * h
     inertia = np.diag([b * b + h * h, b * b + h * h, 2 * b * b]) * mass / 3
     block = dano.Body("block", made(dano.Box((b, b, h))), mass=mass, inertia=inertia, com=(0, 0, 0))
     contact = dano.Contact("block", "floor", dano.ContactParams(sliding_friction=1.0))
-    scene = dano.Scene.create([block, FLOOR], [contact], timestep=timestep)
+    scene = dano.Scene.create([block, floor], [contact], timestep=timestep)
+    below = dict(position=(0, 0, 0 if floor is FLOOR else -0.05))
     seconds = 4.0 * np.sqrt(4 / 3 * np.hypot(b, h) / 9.81)
 
     def angles(tilt):
         q = jnp.stack([jnp.cos(tilt / 2), jnp.sin(tilt / 2), 0.0 * tilt, 0.0 * tilt])
         height = np.hypot(b, h) * jnp.cos(balance - tilt)
         start = dict(position=jnp.stack([0.0 * tilt, 0.0 * tilt, height]), orientation=q)
-        states = dano.simulate(scene, scene.initial_state(block=start), int(seconds / timestep)).states
+        states = dano.simulate(
+            scene, scene.initial_state(block=start, floor=below), int(seconds / timestep)
+        ).states
         return 2 * jnp.arctan2(states.orientation[:, 0, 1], states.orientation[:, 0, 0])
 
     def energy(angle):
@@ -57,6 +61,13 @@ def test_objects_of_flat_faces_rock_as_boxes_do():
     np.testing.assert_allclose(kept(2, 0.1, 1e-3, 4, made), 0.7, rtol=0.04)
 
 
+@pytest.mark.parametrize("ratio", [1, 2, 4])
+def test_a_block_rocks_on_a_table_as_on_a_plane(ratio):
+    """Its edges are as sharp there, and those of the table press, too."""
+    right = abs(1 - 1.5 * np.sin(np.arctan2(1, ratio)) ** 2)
+    np.testing.assert_allclose(kept(ratio, 0.1, 3e-4, 4, floor=TABLE), right, rtol=0.03)
+
+
 def test_the_factor_converges_with_the_step():
     """A cube keeps a quarter; errors shrink with the step."""
     errors = [np.abs(kept(1, 0.1, h, 6) - 0.25).max() for h in (5e-3, 1e-3, 3e-4)]
@@ -66,7 +77,7 @@ def test_the_factor_converges_with_the_step():
 
 @pytest.mark.filterwarnings("ignore::dano.scene.SceneWarning")
 def test_where_contact_is_sharp():
-    """Of boxes and cylinders on half-spaces; not where a body is round, or a spring has impacts."""
+    """Of boxes, cylinders and half-spaces; not where a body is round, or a spring has impacts."""
     cylinder, ball = dano.Cylinder(0.05, 0.05), dano.Sphere(0.05)
 
     def params(shape, law=None, timestep=1e-3, **given):
@@ -89,7 +100,7 @@ def test_where_contact_is_sharp():
 
 
 def test_pairs_that_no_contact_names_are_as_those_that_are_named():
-    """Boxes are sharp on the floor and soft to each other and to a ball; what is set counts as it is."""
+    """Boxes are sharp on the floor and to each other, and soft to a ball; what is set counts as it is."""
     bodies = [dano.Body(name, dano.Box((0.05,) * 3), mass=1.0) for name in "ab"]
     bodies += [dano.Body("c", dano.Sphere(0.05), mass=1.0), FLOOR]
     scene = dano.Scene.create(bodies, others=dano.ContactParams(), timestep=1e-3)

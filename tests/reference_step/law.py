@@ -130,12 +130,18 @@ def pressure(law, points, rate, v_s):
     saturation = x / np.sqrt(1 + x**2) if law.compliant else np.clip(x, -1, 1)
     saturation_slope = (1 + x**2) ** -1.5 if law.compliant else np.where(np.abs(x) < 1, 1, 0)
     c, c_slope = rate / np.maximum(np.abs(rate), v_s), np.where(np.abs(rate) < v_s, 1 / v_s, 0)
-    D = deep * ((rho - sigma) * saturation + sigma * c)
-    D_slope = deep * ((rho - sigma) * saturation_slope / v_e + sigma * c_slope)
-    implicit = np.abs(D) <= np.abs(law.theta * law.h * rate)
-    left = points.depth - np.where(implicit, law.theta * law.h * rate, D)
-    p = law.k * np.maximum(left, 0)
-    slope = -law.k * (left > 0) * np.where(implicit, law.theta * law.h, D_slope)
+    lost = (rho - sigma) * saturation + sigma * c
+    lost_slope = (rho - sigma) * saturation_slope / v_e + sigma * c_slope
+    if law.compliant:
+        D, D_slope = deep * lost, deep * lost_slope
+        implicit = np.abs(D) <= np.abs(law.theta * law.h * rate)
+        left = points.depth - np.where(implicit, law.theta * law.h * rate, D)
+        p = law.k * np.maximum(left, 0)
+        slope = -law.k * (left > 0) * np.where(implicit, law.theta * law.h, D_slope)
+    else:
+        left = np.maximum(points.depth - law.theta * law.h * rate, 0)
+        p = law.k * left * (1 - lost)
+        slope = -law.k * (left > 0) * (law.theta * law.h * (1 - lost) + left * lost_slope)
 
     missing = np.maximum(goals(law, points) - rate, 0)
     # Samples that are less deep than the impact get no deeper, or, where bodies wait until they meet, by so

@@ -134,8 +134,13 @@ def newton(step, start, softness, enough, most=50):
 
 
 def missed(R, slope, x):
-    """Largest residual over 1 + the largest velocity, without what comes from rounding of the unknowns."""
-    return np.max(np.abs(R) - 1e-15 * np.abs(slope) @ np.abs(x)) / (1 + np.abs(x).max())
+    """Largest residual over 1 + the largest velocity, without what comes from rounding of the unknowns.
+
+    That is no more than a millionth: far from a root everything is large.
+    """
+    size = 1 + np.abs(x).max()
+    rounded = np.minimum(1e-15 * np.abs(slope) @ np.abs(x), 1e-6 * size)
+    return np.max(np.abs(R) - rounded) / size
 
 
 def root(step):

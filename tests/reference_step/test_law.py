@@ -100,10 +100,10 @@ def test_the_law_in_closed_form():
     # Slowly going in: all of the hysteresis, none of the damper.
     p, _ = pressure(law, deep, np.full(N, -1e-6), law.v_s)
     np.testing.assert_allclose(p, law.k * 0.002 * (1 + law.sigma), rtol=1e-4)
-    # At v_e nothing presses; faster in than depth over h, the pressure is that of the end of the step.
+    # At v_e nothing presses; in as fast, twice the pressure of the depth at the end of the step.
     assert np.all(pressure(law, deep, np.full(N, law.v_e), law.v_s)[0] == 0)
     p, _ = pressure(law, deep, np.full(N, -3.0), law.v_s)
-    np.testing.assert_allclose(p, law.k * (0.002 + law.h * 3.0))
+    np.testing.assert_allclose(p, 2 * law.k * (0.002 + law.h * 3.0))
     slip = np.cross(points.normal, np.array([0.0, 0.0, 1.0]))
     found = traction(law, deep, np.zeros(N), slip)
     np.testing.assert_allclose(np.linalg.norm(found.f, axis=1), law.mu * found.p)

@@ -27,8 +27,8 @@ CHUNK = 16
 SINKING = 0.005
 IMPACT_DEPTH = 0.005
 """Depth of an impact over the size of the smaller body, at default."""
-# Where edges and faces meet a plane: share by which a body sinks, and least depth of an impact over that of
-# others. A face that closes over a cushion lands row by row: many small impacts lose less than one.
+# Where edges and faces of both bodies are known: share by which a body sinks, and least depth of an impact
+# over that of others. A face that closes over a cushion lands row by row: many small impacts lose less.
 _SHARP_SINKING, _SHARP_DEPTH = 1e-4, 2e-3
 # Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
 _SLOW = 0.2
@@ -76,11 +76,10 @@ class DistributedLaw(AbstractContactLaw):
     A sample of area A at depth d below the other body's surface, with outward normal n there, separating at
     v_n and slipping at u, feels
 
-        F = A p (n − μ(p) c(u/v_s)),   p = k max(0, d − D),
-        D = d ((ρ − σ) s(v_n/v_e) + σ c(v_n/v_s))  or  θ h v_n,  whichever is larger,
+        F = A p (n − μ(p) c(u/v_s)),   p = k max(0, d − θ h v_n) (1 − (1 − σ) x − σ c(v_n/v_s))
 
-    with ρ = 1 and s(x) = x up to its limits ±1 (with `compliant`: ρ = (1 − e²)/(1 + e²), s(x) = x/√(1 + x²)),
-    c(x) = x/max(|x|, 1), v_e not below √(g d)/5, and μ(p) = μ (1 − φ p/(p + p₀)); A is the part of the
+    with x = v_n/v_e up to its limits ±1, c(x) = x/max(|x|, 1), v_e not below √(g d)/5, and
+    μ(p) = μ (1 − φ p/(p + p₀)) (with `compliant` p is another); A is the part of the
     sample's area that faces the other body (see `ContactParams` for the parameters). Velocities are those at
     the end of the step.
     Torsional and rolling resistance come out of the geometry. Where both bodies have samples, each set
@@ -93,8 +92,8 @@ class DistributedLaw(AbstractContactLaw):
 
     Default stiffness: set down on a rigid floor in a typical (the median) orientation, so on a corner, an
     edge or a bulge, under the weight of the heaviest body of the scene, a body sinks by 0.5 % of its size; on
-    a flat side by much less; where edges and faces meet a plane, by 0.01 %. Default restitution velocity:
-    √(g · 0.5 % size)/5, small against impacts, large against what is left of motion at rest.
+    a flat side by much less; where edges and faces of both are known, by 0.01 %. Default restitution
+    velocity: √(g · 0.5 % size)/5, small against impacts, large against what is left of motion at rest.
 
     Attributes:
         stiction_velocity: v_s, slip up to which friction counts as sticking [m/s].
@@ -188,7 +187,7 @@ def _slow(gravity: Float[Q, ""], size: Any) -> Float[AnyArray, ""]:
 
 @by_numpy
 def _sharp_depth(gravity: Float[Q, ""], timestep: Float[Q, ""], depth: Float[Q, ""]) -> Float[AnyArray, ""]:
-    """Depth of an impact [m] where edges and faces meet a plane, from that of others.
+    """Depth of an impact [m] where edges and faces of both bodies are known, from that of others.
 
     A body that is held is taken to fall until it meets others, within a step by g h²: that is no impact.
     """

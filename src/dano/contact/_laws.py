@@ -157,7 +157,7 @@ class Setting(NamedTuple):
         stiffness: Gives the stiffness [Pa/m] at which either body, set down on a rigid floor in a typical
             orientation, sinks by at most a share of its size.
         timestep: h [s].
-        sharp: Whether a body whose edges and faces are known exactly meets a plane.
+        sharp: Whether edges and faces of both bodies are known exactly.
     """
 
     size: float

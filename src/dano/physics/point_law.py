@@ -1,7 +1,7 @@
 """The distributed law at a point (docs/theory/contact.md, "Pressure and friction at a sample").
 
     F = A p (n − b(p)/p u / max(|u|, v_s)),   b(p) = μ (1 − φ p/(p + p₀)) p,
-    p = (1 − β) k max(0, d − D) + κ w max(0, v* − v_n) + κ max(0, v_δ − v_n)
+    p = (1 − β) k max(0, d − θ h v_n) (1 − l) + κ w max(0, v* − v_n) + κ max(0, v_δ − v_n)
 
 Friction and hysteresis are set-valued maps u/max(|u|, v_s) of a tiny v_s. A solver that knows them by their
 values only has to search for where bodies stick. So the law is also written without a quotient, with the
@@ -70,8 +70,8 @@ class PointLaw:
 
     stiffness: real  # k [Pa/m]
     depth: real  # d [m]
-    damped: real  # (ρ − σ) d⁺ [m]
-    lost: real  # σ d⁺ [m]
+    damped: real  # ρ − σ [1]; times d⁺ [m] where impacts are left to the spring
+    lost: real  # σ [1]; times d⁺ [m] where impacts are left to the spring
     ahead: real  # θ h [s]
     restitution_velocity: real  # v_e, or the speed at which a deep overlap may separate, if larger [m/s]
     friction: real  # μ [1]
@@ -181,6 +181,11 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
     law.depth = point.depth
     law.ahead = material.ahead
     sunk = wp.max(point.depth, ZERO)
+    law.damped = loss - kept
+    law.lost = kept
+    if material.instant == ZERO:
+        law.damped *= sunk
+        law.lost *= sunk
     if impact.stiffness > ZERO:
         law.blow = impact.part * impact.stiffness * fading_in(point.sunk / impact.depth)
         law.guard = impact.part * impact.stiffness
@@ -188,8 +193,6 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
         law.goal = impact_goal(
             impact, material.restitution, material.bounce, point.approach, point.meets, point.gains_after
         )
-    law.damped = (loss - kept) * sunk
-    law.lost = kept * sunk
     law.restitution_velocity = wp.sqrt(
         wp.max(material.restitution_velocity * material.restitution_velocity, material.uplift * sunk)
     )
@@ -230,15 +233,14 @@ def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pres
 
     Of its three parts the last two are those of an impact, see `dano.physics.impacts`.
 
-    D is what the separating speed takes off the depth d, the larger of
+    The first is k (d − θ h v_n) (1 − l). The depth is that at the end of the step, or in its middle, which
+    makes the spring implicit. Of the loss l = (1 − σ) x + σ c(v_n / v_s), x is v_n / v_e up to its limits ±1
+    and c(x) = x / max(|x|, 1): a damper, and the share σ that is lost however slow the motion, which stops
+    rolling and rocking. v_e grows with the depth: nothing is pushed out faster.
 
-    - d⁺ ((ρ − σ) s(v_n / v_e) + σ c(v_n / v_s)) with s(x) = x / √(1 + x²), c(x) = x / max(|x|, 1) and
-      ρ = (1 − e²)/(1 + e²): the force going in exceeds that going out by 1/e² whatever the path, so an impact
-      returns e² of its energy. Slower than v_e all but the share σ ≤ ρ becomes a damper; σ is lost however
-      slow the motion, which stops rolling and rocking. Where impacts end within the step, ρ = 1 and s(x) is
-      x up to its limits ±1, and v_e grows with the depth: nothing is pushed out faster;
-    - θ h v_n: the depth at the end of the step, or in its middle, instead of its start, which makes the
-      spring implicit.
+    Where impacts are left to the spring it is k (d − D) with the larger of θ h v_n and
+    d⁺ ((ρ − σ) s(v_n / v_e) + σ c), s(x) = x / √(1 + x²) and ρ = (1 − e²)/(1 + e²): the force going in
+    exceeds that going out by 1/e² whatever the path, so an impact returns e² of its energy.
 
     Args:
         law: Constants of the point.
@@ -261,16 +263,23 @@ def pressure(law: PointLaw, rate: real, direction: real, stiction: real) -> Pres
     found.direction_change = fitting - direction
     by_loss = law.damped * saturation + law.lost * fitting
     by_time = law.ahead * rate
-    lossy = wp.abs(by_loss) > wp.abs(by_time)
-    left = law.depth - wp.where(lossy, by_loss, by_time)
-    if left > ZERO:
-        found.value = law.stiffness * left
+    slower = law.damped / law.restitution_velocity * saturation_slope + law.lost * found.direction_by_speed
+    left = law.depth - by_time
+    kept = ONE - by_loss
+    if law.sharp > ZERO:
+        if left > ZERO:
+            found.value = law.stiffness * left * kept
+            found.damping = law.stiffness * (law.ahead * kept + left * slower)
+            found.change = -law.stiffness * left * law.lost * found.direction_change
+    else:
+        lossy = wp.abs(by_loss) > wp.abs(by_time)
         if lossy:
-            slower = law.damped / law.restitution_velocity * saturation_slope
-            found.damping = law.stiffness * (slower + law.lost * found.direction_by_speed)
-            found.change = -law.stiffness * law.lost * found.direction_change
-        else:
-            found.damping = law.stiffness * law.ahead
+            left = law.depth - by_loss
+        if left > ZERO:
+            found.value = law.stiffness * left
+            found.damping = law.stiffness * wp.where(lossy, slower, law.ahead)
+            if lossy:
+                found.change = -law.stiffness * law.lost * found.direction_change
     if law.blow > ZERO and rate < law.goal:
         found.value += law.blow * (law.goal - rate)
         found.damping += law.blow

@@ -1,6 +1,6 @@
 """Bodies: geometry, mass properties, and a name."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -209,12 +209,7 @@ class Body(eqx.Module):
             return self.object.is_flat
         if isinstance(self.shape, Box):
             return not is_traced(self.shape.rounding) and float(self.shape.rounding) == 0
-        return isinstance(self.shape, Cylinder)
-
-    @property
-    def is_plane(self) -> bool:
-        """Whether the body is a half-space."""
-        return isinstance(self.shape, HalfSpace)
+        return isinstance(self.shape, Cylinder | HalfSpace)
 
     @property
     def centre_of_mass(self) -> Float[Array, "3"]:
@@ -419,3 +414,12 @@ def _homogeneous(name: str, shape: AbstractShape, mass: float) -> MassProperties
         return MassProperties.from_field(shape, mass=mass)
     second = np.asarray(moments.second_moment) * (mass / float(moments.volume))
     return MassProperties(mass, moments.centroid, np.trace(second) * np.eye(3) - second)
+
+
+def are_flat(bodies: Sequence[Body]) -> list[bool]:
+    """Which bodies are flat; an object that several of them have is looked at once."""
+    found: dict[int, bool] = {}
+    for body in bodies:
+        if body.object is not None and id(body.object) not in found:
+            found[id(body.object)] = body.is_flat
+    return [body.is_flat if body.object is None else found[id(body.object)] for body in bodies]

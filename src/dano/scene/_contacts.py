@@ -22,7 +22,7 @@ from dano.contact import (
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
 from dano.maths import AnyArray, by_numpy, floating, library, Numbers, Q
 from dano.objects import draw_contact_samples, NeuralObject, surface_quadrature
-from dano.scene._bodies import Body
+from dano.scene._bodies import are_flat, Body
 from dano.scene._states import State
 
 # Edge width of a primitive relative to the size of what touches it: 0.5 % made gradients and rest
@@ -121,20 +121,16 @@ def prepared(
                 by_name[body.name] = _with_samples(body)
     weight, strength = heaviest(bodies, gravity)
     carried = functools.cache(lambda name, sinking: by_name[name].typical_support(sinking * sizes[name]))
+    flat = dict(zip(by_name, are_flat(list(by_name.values())), strict=True))
     completed = []
     for contact in contacts:
         a, b = by_name[contact.a], by_name[contact.b]
         stiffness = functools.partial(_stiffness, a, b, weight, carried)
         size = min(sizes[a.name], sizes[b.name])
-        setting = Setting(size, strength, stiffness, timestep, is_sharp(a, b))
+        setting = Setting(size, strength, stiffness, timestep, flat[a.name] and flat[b.name])
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
     return tuple(by_name[body.name] for body in bodies), tuple(completed)
-
-
-def is_sharp(a: Body, b: Body) -> bool:
-    """Whether edges and faces of one body, known exactly, meet a plane."""
-    return (a.is_plane and b.is_flat) or (b.is_plane and a.is_flat)
 
 
 def colliders(

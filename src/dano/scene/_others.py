@@ -14,13 +14,12 @@ from jaxtyping import Array, Float
 
 from dano.checks import shown
 from dano.contact import combined, ContactParams, DistributedLaw, Setting
-from dano.scene._bodies import Body
+from dano.scene._bodies import are_flat, Body
 from dano.scene._contacts import (
     check_objects,
     checked_support,
     Contact,
     heaviest,
-    is_sharp,
     with_surface,
 )
 from dano.scene._joints import joined, Joint
@@ -31,8 +30,8 @@ MOST_LISTED = 200
 numbers are leaves of the scene; `Others` holds those of thousands in arrays."""
 
 
-class OnPlanes(NamedTuple):
-    """Parameters of each body where edges and faces meet a plane, arrays of shape (n,)."""
+class OfEdges(NamedTuple):
+    """Parameters of each body where edges and faces of both bodies are known, arrays of shape (n,)."""
 
     stiffness: Float[Array, " n"]  # k [Pa/m]
     impact_depth: Float[Array, " n"]  # δ [m]
@@ -45,14 +44,14 @@ class Others(eqx.Module):
 
     Attributes:
         params: Of each body of the scene, arrays of shape (n,).
-        on_planes: Some of them where edges and faces meet a plane.
+        of_edges: Some of them where edges and faces of both bodies are known.
         law: Of all these pairs.
         pairs: Indices of the bodies of each pair (static).
-        sharp: Whether in a pair edges and faces meet a plane (static).
+        sharp: Whether in a pair edges and faces of both bodies are known (static).
     """
 
     params: ContactParams
-    on_planes: OnPlanes
+    of_edges: OfEdges
     law: DistributedLaw
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
@@ -69,7 +68,7 @@ class Others(eqx.Module):
         found = combined(a, b)
         if not any(self.sharp):
             return found
-        k, depth, sharp = *self.on_planes, np.array(self.sharp)
+        k, depth, sharp = *self.of_edges, np.array(self.sharp)
         stiffness = jnp.where(sharp, jnp.maximum(k[first], k[second]), found.stiffness)
         depth = jnp.where(sharp, jnp.minimum(depth[first], depth[second]), found.impact_depth)
         return eqx.tree_at(lambda p: (p.stiffness, p.impact_depth), found, (stiffness, depth))
@@ -122,9 +121,10 @@ def others_of(
         return tuple(bodies), None
     touching = {i for pair in pairs for i in pair}
     bodies = tuple(with_surface(body) if i in touching else body for i, body in enumerate(bodies))
-    sharp = tuple(is_sharp(bodies[i], bodies[j]) for i, j in pairs)
-    complete, on_planes = _stacked(bodies, pairs, sharp, law, params, timestep, gravity)
-    return bodies, Others(complete, on_planes, law, tuple(pairs), sharp)
+    flat = are_flat(bodies)
+    sharp = tuple(flat[i] and flat[j] for i, j in pairs)
+    complete, of_edges = _stacked(bodies, pairs, sharp, law, params, timestep, gravity)
+    return bodies, Others(complete, of_edges, law, tuple(pairs), sharp)
 
 
 def unnamed_contacts(
@@ -219,8 +219,8 @@ def _stacked(
     usual: ContactParams,
     timestep: Float[Array, ""],
     gravity: Float[Array, "3"],
-) -> tuple[ContactParams, OnPlanes]:
-    """Complete parameters of all bodies as arrays, and those where edges and faces meet a plane.
+) -> tuple[ContactParams, OfEdges]:
+    """Complete parameters of all bodies as arrays, and those where edges and faces of both are known.
 
     What does not move or has no end presses as softly, and is as large, as what it may meet: the other body
     decides.
@@ -240,7 +240,7 @@ def _stacked(
         return lambda sinking: functools.reduce(jnp.minimum, [stiffness(k, sinking) for k in decide])
 
     met = {i for pair, is_so in zip(pairs, sharp, strict=True) if is_so for i in pair}
-    complete, on_planes = [], []
+    complete, of_edges = [], []
     for i, body in enumerate(bodies):
         given = usual if body.material is None else body.material
         size = min(body.size, largest)
@@ -248,6 +248,6 @@ def _stacked(
         there = complete[-1]
         if i in met:
             there = law.complete(given, Setting(size, strength, rule(i), timestep, True))
-        on_planes.append(OnPlanes(there.stiffness, there.impact_depth))
-    found, there = (jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (complete, on_planes))
+        of_edges.append(OfEdges(there.stiffness, there.impact_depth))
+    found, there = (jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (complete, of_edges))
     return found, there

@@ -43,7 +43,7 @@ from dano.scene._making import (
     warn_of_long_steps,
 )
 from dano.scene._motors import Motor
-from dano.scene._others import OnPlanes, Others, others_of, unnamed_contacts
+from dano.scene._others import OfEdges, Others, others_of, unnamed_contacts
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
 
 Parts = TypeVar("Parts", tuple[Joint, ...], tuple[Loop, ...])
@@ -325,13 +325,11 @@ class Scene(eqx.Module):
         params = self.others.params
         values = [getattr(params, k).at[i].set(checked_parameter(k, value)) for k, value in changes.items()]
         scene = eqx.tree_at(lambda s: [getattr(s.others.params, key) for key in changes], self, values)
-        of_planes = {
-            key: value for key, value in zip(changes, values, strict=True) if key in OnPlanes._fields
-        }
-        on_planes = self.others.on_planes
-        for key, value in of_planes.items():
-            on_planes = on_planes._replace(**{key: getattr(on_planes, key).at[i].set(value[i])})
-        return eqx.tree_at(lambda s: s.others.on_planes, scene, on_planes)
+        edges = {key: value for key, value in zip(changes, values, strict=True) if key in OfEdges._fields}
+        of_edges = self.others.of_edges
+        for key, value in edges.items():
+            of_edges = of_edges._replace(**{key: getattr(of_edges, key).at[i].set(value[i])})
+        return eqx.tree_at(lambda s: s.others.of_edges, scene, of_edges)
 
     def replace_body(self, name: str, **changes: Numbers) -> "Scene":
         """The scene with some of a body's `mass, inertia, com, mass_scale, com_offset` changed.

@@ -73,7 +73,8 @@ class Options:
 
     tolerance: real  # Residual over (1 + size) that counts as solved
     rounding: real  # Of the numbers
-    fit: real  # What duals may miss, in shares of all pressure
+    # What duals may miss, in shares of all pressure, and a residual by rounding, over (1 + size)
+    fit: real
     max_passes: int  # Passes after which a solve gives up
 
 
@@ -343,7 +344,9 @@ def solve_island(
                 add_tree_slopes(scene, room, world)
             wait()
         seen = measure(scene, room, world, lane, island)
-        tolerance = wp.max(options.tolerance * (ONE + size), real(16.0) * options.rounding * seen.size)
+        # Far from a root everything is large, what rounding leaves there, too.
+        rounded = wp.min(real(16.0) * options.rounding * seen.size, options.fit * (ONE + size))
+        tolerance = wp.max(options.tolerance * (ONE + size), rounded)
         hard = level.softness == ONE
         enough = tolerance
         if not hard:
