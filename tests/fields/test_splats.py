@@ -208,6 +208,13 @@ def test_newton_draws_them(folder):
     assert builder.body_mass[0] == pytest.approx(0.3, rel=1e-6)
 
 
+def met(splats: Splats, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Where a ray meets splats, which it does."""
+    found = struck(splats, origin, direction)
+    assert found is not None
+    return found
+
+
 def test_a_ray_meets_what_is_seen_first():
     """One opaque Gaussian before another: at its middle; beside both nothing."""
     sigma = 0.01
@@ -219,14 +226,14 @@ def test_a_ray_meets_what_is_seen_first():
         colours=np.zeros((3, 1, 3)),
     )
     down = np.array([0.0, 0, -1])
-    np.testing.assert_allclose(struck(two, np.array([0.005, 0, 1.0]), down), (0.005, 0, 0.2), atol=1e-12)
+    np.testing.assert_allclose(met(two, np.array([0.005, 0, 1.0]), down), (0.005, 0, 0.2), atol=1e-12)
     # Behind the first one, and from between them upwards.
-    np.testing.assert_allclose(struck(two, np.array([0.0, 0, 0.1]), down), (0, 0, 0), atol=1e-12)
-    np.testing.assert_allclose(struck(two, np.array([0.0, 0, 0.1]), -down), (0, 0, 0.2), atol=1e-12)
+    np.testing.assert_allclose(met(two, np.array([0.0, 0, 0.1]), down), (0, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(met(two, np.array([0.0, 0, 0.1]), -down), (0, 0, 0.2), atol=1e-12)
     assert struck(two, np.array([0.02, 0, 1.0]), down) is None
     # Opacity α lets 1 − α through: 0.7² is the first below a half.
     thin = dataclasses.replace(two, opacities=np.full(3, math.log(0.3 / 0.7)))
-    np.testing.assert_allclose(struck(thin, np.array([0.0, 0, 1.0]), down), (0, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(met(thin, np.array([0.0, 0, 1.0]), down), (0, 0, 0), atol=1e-12)
     # A long Gaussian along x that is turned to y is met far along y.
     long = dataclasses.replace(
         two,
