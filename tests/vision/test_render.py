@@ -97,10 +97,11 @@ def test_the_shadow_lies_opposite_to_the_lamp():
 
 
 def test_rays_of_a_pixel_get_the_light_that_each_would_get_alone():
-    items = [Item(Sphere(0.2), Pose((0.0, 0.0, 0.35))), Item(Box((0.1, 0.1, 0.1)), Pose((0.3, 0.1, 0.1)))]
+    shapes = [(Sphere(0.2), (0.0, 0.0, 0.35)), (Box((0.1, 0.1, 0.1)), (0.3, 0.1, 0.1))]
+    items = [(shape, Item(shape, Pose(place))) for shape, place in shapes]
     things = [
-        Thing(item.shape, np.eye(3), np.asarray(item.pose.position), *item.placed_ball, False)
-        for item in items
+        Thing(shape, np.eye(3), np.asarray(item.pose.position), *item.placed_ball, False)
+        for shape, item in items
     ]
     camera = Camera((0.6, -1.5, 1.2), (0.1, 0.0, 0.15), width=160, height=120)
     light = np.array([0.6, -0.3, 1.0])
