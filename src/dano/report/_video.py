@@ -428,7 +428,7 @@ def _seen_to_move(take: Take, cameras: Sequence[AbstractCamera], before: int, no
     if camera is not old and not _is_shifted(camera, old):
         return np.inf
     stage = take.drawn
-    bounded = np.array([item.plane is None for item in stage.items])
+    bounded = np.array([item.plane is None for item in stage.items], dtype=bool)
     offset = np.linalg.norm(np.reshape(stage.offsets, (-1, 3)), axis=1)
     reach = offset + [float(np.linalg.norm(item.centre)) + item.radius for item in stage.items]
     place, start = (take.position[k][stage.rows] for k in (now, before))
