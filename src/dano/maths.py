@@ -115,15 +115,16 @@ def safe_normalize(x: Float[Q, "*shape"], axis: int = -1) -> Float[Q, "*shape"]:
     return x / xp.where(norm > 0, norm, 1)
 
 
-def skew(v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
+def skew(v: Float[Q, "*batch 3"]) -> Float[Q, "*batch 3 3"]:
     """Cross-product matrix: ``skew(v) @ w == v × w``."""
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    zero = jnp.zeros_like(x)
-    return jnp.stack(
+    xp = library(v)
+    zero = xp.zeros_like(x)
+    return xp.stack(
         [
-            jnp.stack([zero, -z, y], -1),
-            jnp.stack([z, zero, -x], -1),
-            jnp.stack([-y, x, zero], -1),
+            xp.stack([zero, -z, y], -1),
+            xp.stack([z, zero, -x], -1),
+            xp.stack([-y, x, zero], -1),
         ],
         -2,
     )

@@ -235,13 +235,13 @@ def _identification(
     seen = known[known >= 0]
     least = problem.least_variance
     independent = setup.options.independent
-    said = (space, best.x, best.normal, seen, setup.options.huber, plan.n_data, scene, ripple, least)
-    sure = uncertainty(*said, None if independent == "numbers" else problem.groups(at_best, independent))
+    shared = (space, best.x, best.normal, seen, setup.options.huber, plan.n_data, scene, ripple, least)
+    sure = uncertainty(*shared, None if independent == "numbers" else problem.groups(at_best, independent))
     values, errors = values_at(space.selections, best.x, sure.covariance)
     fit_errors = _errors(plan, motions, at_best)
     messages = list(sure.messages)
     if independent == "numbers" and len(motions) > len(space.start) + 1:
-        between = uncertainty(*said, problem.groups(at_best, "motions"))
+        between = uncertainty(*shared, problem.groups(at_best, "motions"))
         messages += scattered(space.labels, sure.covariance, between.covariance, len(motions))
     if failed := int(np.sum(np.asarray(at_best.unconverged))):
         page = see("steps-did-not-converge")

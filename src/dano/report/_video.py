@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from dano.archive import checked_output, replacing
 from dano.checks import (
@@ -413,26 +413,41 @@ def _painter(
     return lambda frame: drawn(int(shown[frame])).copy()
 
 
+class _Extents(NamedTuple):
+    """What does not change from frame to frame of the things that are drawn."""
+
+    bounded: Bool[np.ndarray, " items"]
+    reach: Float[np.ndarray, " items"]  # Farthest point from the centre of mass [m]
+
+    @classmethod
+    def of(cls, stage: Stage) -> "_Extents":
+        offset = np.linalg.norm(np.reshape(stage.offsets, (-1, 3)), axis=1)
+        return cls(
+            np.array([item.plane is None for item in stage.items], dtype=bool),
+            offset + [float(np.linalg.norm(item.centre)) + item.radius for item in stage.items],
+        )
+
+
 def _first_alike(take: Take, cameras: Sequence[AbstractCamera]) -> Int[np.ndarray, " frames"]:
     """For each frame, the first one of those since which nothing is seen to move."""
-    first = np.zeros(len(take.times), dtype=int)
+    first, extents = np.zeros(len(take.times), dtype=int), _Extents.of(take.drawn)
     for frame in range(1, len(first)):
         before = int(first[frame - 1])
-        first[frame] = before if _seen_to_move(take, cameras, before, frame) < _UNSEEN else frame
+        moved = _seen_to_move(take, extents, cameras, before, frame)
+        first[frame] = before if moved < _UNSEEN else frame
     return first
 
 
-def _seen_to_move(take: Take, cameras: Sequence[AbstractCamera], before: int, now: int) -> float:
+def _seen_to_move(
+    take: Take, extents: _Extents, cameras: Sequence[AbstractCamera], before: int, now: int
+) -> float:
     """A bound on how far anything moves in the picture [pixels] between two frames."""
     old, camera = cameras[before], cameras[now]
     if camera is not old and not _is_shifted(camera, old):
         return np.inf
-    stage = take.drawn
-    bounded = np.array([item.plane is None for item in stage.items], dtype=bool)
-    offset = np.linalg.norm(np.reshape(stage.offsets, (-1, 3)), axis=1)
-    reach = offset + [float(np.linalg.norm(item.centre)) + item.radius for item in stage.items]
-    place, start = (take.position[k][stage.rows] for k in (now, before))
-    turned, straight = (take.orientation[k][stage.rows] for k in (now, before))
+    bounded, reach, rows = extents.bounded, extents.reach, take.drawn.rows
+    place, start = (take.position[k][rows] for k in (now, before))
+    turned, straight = (take.orientation[k][rows] for k in (now, before))
     # Quaternions of both signs are one orientation.
     angle = 2 * np.minimum(*(np.linalg.norm(turned - sign * straight, axis=1) for sign in (1, -1)))
     if (angle[~bounded] > 0).any():

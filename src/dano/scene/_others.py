@@ -108,15 +108,13 @@ def others_of(
     ends = [_Ends.of(body, True) for body in bodies]
     pairs = []
     for (i, a), (j, b) in itertools.combinations(enumerate(ends), 2):
-        if (a.fixed and b.fixed) or (left_out and frozenset((a.name, b.name)) in left_out):
-            continue
-        if joints and neighbours(a.name, b.name):
+        if (left_out and frozenset((a.name, b.name)) in left_out) or neighbours(a.name, b.name):
             continue
         first, second = bodies[i].object, bodies[j].object
-        if first is not None and second is not None:
-            check_objects(Contact(a.name, b.name), first, second)
-        if a.finite or b.finite:
+        if a.can_touch(b):
             pairs.append((i, j))
+        elif not (a.fixed and b.fixed) and first is not None and second is not None:
+            check_objects(Contact(a.name, b.name), first, second)
     if not pairs:
         return tuple(bodies), None
     touching = {i for pair in pairs for i in pair}

@@ -8,7 +8,7 @@ import numpy as np
 
 from dano.identification.wrench._log import Twists
 from dano.identification.wrench._shape import about_centre, matrix_of, of_a_body, within_shape
-from dano.maths import quat_conjugate, quat_rotate
+from dano.maths import quat_conjugate, quat_rotate, skew
 from dano.objects import MassProperties
 
 _PASSES = 4
@@ -129,11 +129,11 @@ def wrench_table(moved: Twists, gravity: np.ndarray) -> np.ndarray:
     count = len(moved.rows)
     down = np.asarray(quat_rotate(quat_conjugate(moved.turn), np.broadcast_to(gravity, (count, 3))))
     felt = moved.acceleration - down
-    spin, rate = _cross(moved.omega), _cross(moved.alpha)
+    spin, rate = skew(moved.omega), skew(moved.alpha)
     table = np.zeros((count, 6, 10))
     table[:, :3, 0] = felt
     table[:, :3, 1:4] = rate + spin @ spin
-    table[:, 3:, 1:4] = -_cross(felt)
+    table[:, 3:, 1:4] = -skew(felt)
     table[:, 3:, 4:10] = _inertial(moved.alpha) + spin @ _inertial(moved.omega)
     return table
 
@@ -310,12 +310,4 @@ def _inertial(vectors: np.ndarray) -> np.ndarray:
     x, y, z = vectors.T
     none = np.zeros_like(x)
     rows = [[x, none, none, y, z, none], [none, y, none, x, none, z], [none, none, z, none, x, y]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """What takes a vector to its product with vectors from the left, shape (n, 3, 3)."""
-    x, y, z = vectors.T
-    none = np.zeros_like(x)
-    rows = [[none, -z, y], [z, none, -x], [-y, x, none]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

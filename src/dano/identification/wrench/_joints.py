@@ -11,7 +11,7 @@ from dano.checks import checked_kind, checked_text
 from dano.identification.wrench._estimate import check_slip, fitted, Load, load_of, Rows, shares, wrench_table
 from dano.identification.wrench._log import surroundings, Twists, twists, WristLog
 from dano.identification.wrench._shape import point_masses
-from dano.maths import checked_numbers, Numbers
+from dano.maths import checked_numbers, Numbers, quat_to_matrix
 from dano.robots import computed_torque
 from dano.scene import Scene
 
@@ -170,7 +170,7 @@ def _moved(log: JointLog, scene: Scene, index: int) -> _Moved:
     whole = np.nan_to_num(log.q)
     position, orientation, jacobian = (np.asarray(x, float) for x in _mapped(pose, dtype, whole))
     needed = np.asarray(_mapped(torque, dtype, log.q[around.middle], v, gained), float)
-    turns = np.asarray(_matrices(orientation))
+    turns = quat_to_matrix(orientation)
     arm = np.asarray(scene.bodies[index].centre_of_mass, float)
     origin = position - turns @ arm
     nothing = np.where(known[:, None], np.zeros((len(known), 3)), np.nan)
@@ -184,9 +184,3 @@ def _moved(log: JointLog, scene: Scene, index: int) -> _Moved:
 
 def _mapped(function, dtype, *arrays: np.ndarray):
     return jax.jit(jax.vmap(function))(*(jnp.asarray(x, dtype) for x in arrays))
-
-
-def _matrices(quaternions: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()

@@ -59,8 +59,7 @@ def within_shape(
     """
     from scipy.optimize import nnls
 
-    scale = np.sqrt(np.diagonal(covariance))
-    root = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-12 * np.eye(10))
+    scale, root = _root(covariance)
     whitened = np.linalg.solve(root, bodies / scale[:, None])
 
     def likeliest(values: np.ndarray) -> np.ndarray:
@@ -84,8 +83,7 @@ def of_a_body(theta: np.ndarray, covariance: np.ndarray) -> np.ndarray | None:
         return None
     from scipy.optimize import least_squares
 
-    scale = np.sqrt(np.diagonal(covariance))
-    root = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-12 * np.eye(10))
+    scale, root = _root(covariance)
 
     def off(x: np.ndarray) -> np.ndarray:
         return np.linalg.solve(root, (_of_factor(x) - theta) / scale)
@@ -95,6 +93,12 @@ def of_a_body(theta: np.ndarray, covariance: np.ndarray) -> np.ndarray | None:
     factor = np.linalg.cholesky(near)
     start = np.concatenate([np.log(np.diagonal(factor)), factor[np.tril_indices(4, -1)]])
     return _of_factor(least_squares(off, start, x_scale="jac").x)
+
+
+def _root(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations, and the Cholesky factor of the correlations, which may be singular to rounding."""
+    scale = np.sqrt(np.diagonal(covariance))
+    return scale, np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-12 * np.eye(len(scale)))
 
 
 def _pseudo(theta: np.ndarray) -> np.ndarray:
