@@ -11,9 +11,15 @@ Nothing of this depends on where in a step the bodies meet, on the number of sam
 
 import warp as wp
 
-from dano.physics.pairs import BodyState
-from dano.physics.real import ONE, real, TWO, vec3, ZERO
+from dano.physics.pairs import BodyState, FIXED, spin_of_samples
+from dano.physics.real import HALF, mat33, ONE, real, TWO, vec3, ZERO
+from dano.physics.rotations import matrix, skew
 
+_FIXED = wp.constant(FIXED)
+# Least mobility along an impulse that slides, over that along the normal: what friction jams does not slide.
+_JAMS = wp.constant(real(0.05))
+# A length beside which nothing divides by zero [N s].
+_NOTHING = wp.constant(real(1e-30))
 # Least share of a step after an impact.
 _LATEST = wp.constant(real(1e-6))
 
@@ -38,6 +44,18 @@ class Patch:
 
 
 @wp.struct
+class Turning:
+    """How a point at an arm r from the first body's centre of mass accelerates because its bodies turn.
+
+    That is Q r + q, relative to the second body, in world axes, for all that forces do not do: ω × (ω × r),
+    and what gyroscopic torque does.
+    """
+
+    by_arm: mat33  # Q [1/s²]
+    offset: vec3  # q [m/s²]
+
+
+@wp.struct
 class Impact:
     """The impact of a pair."""
 
@@ -56,6 +74,8 @@ class Impact:
     delays: real
     way: real  # Share of the step in which bodies go on as before, all the same
     rest: real  # Time from when impulses take effect to the end of the step [s]
+    after: real  # Time from when bodies meet to the middle of the step, to which velocities belong [s]
+    turns: Turning  # How points accelerate after it because their body turns
 
 
 @wp.func
@@ -94,6 +114,7 @@ def delayed(impact: Impact, delays: real, share: real, h: real) -> Impact:
     found.delays = delays
     found.way = (ONE - delays) * wp.max(share, ZERO)
     found.rest = wp.max(ONE - delays * share, _LATEST) * h
+    found.after = (HALF - share) * h
     return found
 
 
@@ -154,6 +175,112 @@ def stiffness_of_impact(
 
 
 @wp.func
+def stopping_impulse(velocity: vec3, mobility: mat33, normal: vec3, friction: real) -> vec3:
+    """Impulse that stops a point, as far as friction can, else one that stops it along the normal [N s].
+
+    Args:
+        velocity: Of the point [m/s].
+        mobility: Velocity of the point by impulse at it [1/kg].
+        normal: Unit normal.
+        friction: Coefficient of friction.
+    """
+    stops = -(wp.inverse(mobility) * velocity)
+    presses = wp.dot(normal, stops)
+    across = stops - presses * normal
+    rubs = wp.length(across)
+    if rubs <= friction * presses:
+        return stops
+    along = normal + (friction / wp.max(rubs, _NOTHING)) * across
+    slows = wp.dot(normal, mobility * along)
+    slows = wp.max(slows, _JAMS * wp.dot(normal, mobility * normal))
+    return (wp.max(-wp.dot(normal, velocity), ZERO) / slows) * along
+
+
+@wp.func
+def turning_after(
+    first: BodyState, second: BodyState, patch: Patch, friction: real, share: real, turning: int
+) -> Turning:
+    """How points accelerate by turning after an impact of a body with one that is fixed.
+
+    The spin after it is that of an impulse at the middle of the patch.
+
+    Args:
+        first: The sampled body.
+        second: The other.
+        patch: Samples that have sunk in.
+        friction: Coefficient of friction.
+        share: τ.
+        turning: How samples turn with their body. Those that keep facing the other body feel nothing of it.
+    """
+    found = Turning()
+    normal = patch.normal / wp.max(wp.length(patch.normal), _NOTHING)
+    arm = patch.arm / patch.load
+    away = first.position - second.position
+    body = first
+    if first.inverse_mass == ZERO:
+        body = second
+        arm = arm + away
+        normal = -normal
+    lead = HALF + share
+    v = body.velocity + lead * body.gain
+    spin = body.spin + lead * body.spin_gain
+    inverse = body.inverse_inertia
+    across = skew(arm)
+    mobility = wp.diag(vec3(body.inverse_mass)) - across * inverse * across
+    impulse = stopping_impulse(v + wp.cross(spin, arm), mobility, normal, friction)
+    v = v + body.inverse_mass * impulse
+    spin = spin + inverse * wp.cross(arm, impulse)
+    turns = skew(-(inverse * wp.cross(spin, wp.inverse(inverse) * spin)))
+    if first.inverse_mass > ZERO:
+        if turning != _FIXED:
+            axis = matrix(first.orientation) * vec3(ZERO, ZERO, ONE)
+            spin = spin_of_samples(spin, axis, turning)
+            turns = mat33()
+        found.by_arm = skew(spin) * skew(spin) + turns
+    else:
+        # A point of the first body is at rest, and its arm from the second one's centre changes by −v.
+        found.by_arm = skew(spin) * skew(spin) - turns
+        found.offset = found.by_arm * away + TWO * wp.cross(spin, v)
+    return found
+
+
+@wp.struct
+class Gains:
+    """What the velocity of a point gains from an impact to the middle of the step [m/s, W]."""
+
+    falls: vec3  # If it leaves
+    held: vec3  # By what that differs if it stays
+
+
+@wp.func
+def gains_of(impact: Impact, falls: vec3, arm: vec3, normal: vec3, friction: real) -> Gains:
+    """What a point gains that has stopped in an impact.
+
+    It leaves if turning takes it away faster than gravity brings it back. Else its acceleration along the
+    normal is none, nor is that across as far as friction holds it, of which turning has its part.
+
+    Args:
+        impact: Of the pair.
+        falls: What it gains if it leaves [m/s, W].
+        arm: From the first body's centre of mass [m, W].
+        normal: Unit normal [W].
+        friction: Coefficient of friction.
+    """
+    found = Gains()
+    found.falls = falls
+    differs = -impact.after * (impact.turns.by_arm * arm + impact.turns.offset) - falls
+    along = wp.dot(normal, differs)
+    if along * impact.after > ZERO:
+        across = differs - along * normal
+        most = friction * wp.abs(along)
+        size = wp.length(across)
+        if size > most:
+            across = (most / size) * across
+        found.held = along * normal + across
+    return found
+
+
+@wp.func
 def may_rest(impact: Impact, sunk: real) -> real:
     """From 0 for a sample at a distance of δ to 1 for one that has sunk in: others have not rested before.
 
@@ -163,25 +290,31 @@ def may_rest(impact: Impact, sunk: real) -> real:
 
 
 @wp.func
+def share_that_rebounds(rebound: real, bounce: real) -> real:
+    """From 0 for a rebound of half of `bounce` [m/s] to 1 for `bounce`: slower ones fade out."""
+    return smooth_step(TWO * rebound / bounce - ONE)
+
+
+@wp.func
 def impact_goal(
-    impact: Impact, restitution: real, bounce: real, approach: real, meets: real, gains: real
+    impact: Impact, rebound: real, rebounds: real, approach: real, normal: vec3, gains: Gains
 ) -> real:
     """v*: separating speed that a sample aims at [m/s], so high that the damper leaves it at Newton's e |v⁻|.
 
-    Rebounds slower than `bounce` fade out. Where impulses take effect at the start of the step, what does not
-    rebound goes on for the rest of its way.
+    What does not rebound stays or leaves without a speed. Where impulses take effect at the start of the
+    step, it goes on for the rest of its way instead.
 
     Args:
         impact: Of the pair.
-        restitution: e [1].
-        bounce: Slowest rebound [m/s].
+        rebound: e |v⁻|, with the separating speed v⁻ when bodies meet [m/s].
+        rebounds: Share of it that counts.
         approach: Separating speed with which the step begins [m/s].
-        meets: v⁻, separating speed when bodies meet [m/s].
-        gains: What gravity adds to it from then on [m/s].
+        normal: Unit normal [W].
+        gains: What the velocity gains from then on.
     """
-    rebound = -restitution * meets
-    rebounds = smooth_step(TWO * rebound / bounce - ONE)
-    after = rebounds * (rebound + gains) + (ONE - rebounds) * impact.way * wp.min(approach, ZERO)
+    falls = wp.dot(normal, gains.falls)
+    stays = impact.delays * (falls + wp.dot(normal, gains.held)) + impact.way * wp.min(approach, ZERO)
+    after = rebounds * (rebound + falls) + (ONE - rebounds) * stays
     return after + wp.max(after - approach, ZERO) / impact.factor
 
 

@@ -35,6 +35,7 @@ from dano.physics.impacts import (
     patch_of_sample,
     share_of_impact,
     stiffness_of_impact,
+    turning_after,
 )
 from dano.physics.pairs import (
     BodyState,
@@ -217,6 +218,7 @@ def impact_of(
     material: Material,
     found: FoundPair,
     pair: SamplePair,
+    turning: int,
     alone: bool,
 ) -> Impact:
     """The impact of a pair; none where it approaches slowly.
@@ -228,6 +230,7 @@ def impact_of(
         material: Of the contact.
         found: What is found of the pair.
         pair: The pair.
+        turning: How samples turn with the first body.
         alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
             they meet; between two that move, this would not conserve angular momentum.
     """
@@ -240,6 +243,8 @@ def impact_of(
             )
             delays = wp.where(alone, impact.share, ZERO)
             impact = delayed(impact, delays, found.share, material.timestep)
+            if alone:
+                impact.turns = turning_after(a, b, patch, material.friction, found.share, turning)
     return impact
 
 
@@ -384,7 +389,8 @@ def find_pair(
         found.com_difference = pose.com_difference
         found.impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, h)
         if not lasts:
-            found.impact = impact_of(a, b, patch, material, found, pair, alone)
+            turning = scene.body_index[index.first].turning
+            found.impact = impact_of(seen, other, patch, material, found, pair, turning, alone)
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share

@@ -14,7 +14,14 @@ import warp as wp
 from dano.engine.kernels.tables import Body, Moment, Push, StateRow
 from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
-from dano.physics.impacts import Impact, Patch, patch_of_sample, share_of_impact, stiffness_of_impact
+from dano.physics.impacts import (
+    Impact,
+    Patch,
+    patch_of_sample,
+    share_of_impact,
+    stiffness_of_impact,
+    turning_after,
+)
 from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
 from dano.physics.pairs import (
     BodyState,
@@ -79,10 +86,10 @@ def point_work(
     along = virtual.velocity - (impact.delays * share) * late.velocity
     turn = virtual.spin - (impact.delays * share) * late.spin
     motion = point_motion(point, twist.velocity, twist.spin)
-    found = traction(law, motion.rate, motion.slip + point.extra_slip)
+    found = traction(law, motion.rate, motion.slip + law.extra_slip)
     if at.is_gradual:
         bound = friction_bound(law, found.pressure)
-        found.friction = friction_near(motion.slip + point.extra_slip, bound.value, at)
+        found.friction = friction_near(motion.slip + law.extra_slip, bound.value, at)
     by_pressure = wp.dot(point.normal, along) + wp.dot(point.moment, turn)
     by_friction = wp.dot(found.friction, along + wp.cross(turn, point.arm))
     return h * point.area * (found.pressure * by_pressure + by_friction)
@@ -264,14 +271,21 @@ def impact_work(
     patch: Patch,
     bounce: real,
     factor: real,
+    friction: real,
+    share: real,
     h: real,
+    turning: int,
     hits: bool,
+    alone: bool,
     bar: Impact,
 ) -> real:
-    """⟨bar, share and stiffness of an impact⟩."""
+    """⟨bar, share and stiffness of an impact, and how points accelerate after it⟩."""
     work = bar.share * share_of_impact(patch, bounce)
     if hits:
         work += bar.stiffness * stiffness_of_impact(first, second, patch, bounce, factor, h)
+        if alone:
+            turns = turning_after(first, second, patch, friction, share, turning)
+            work += wp.ddot(bar.turns.by_arm, turns.by_arm) + wp.dot(bar.turns.offset, turns.offset)
     return work
 
 

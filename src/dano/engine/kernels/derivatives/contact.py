@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.assembly import presses, slip_of
+from dano.engine.kernels.assembly import presses
 from dano.engine.kernels.derivatives.adjoint import (
     after_adjoints,
     distance_work,
@@ -25,7 +25,7 @@ from dano.engine.kernels.derivatives.products import (
     total_material,
     total_pose,
 )
-from dano.engine.kernels.lanes import total, total6
+from dano.engine.kernels.lanes import total, total3, total33, total6
 from dano.engine.kernels.near import posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, UNIONS
@@ -40,8 +40,8 @@ from dano.physics.pairs import (
     position_after,
     rotation_after,
 )
-from dano.physics.point_law import Material, point_motion, slip_at
-from dano.physics.real import mat33, ONE, real, vec3, ZERO
+from dano.physics.point_law import Material, point_motion, slip_at, slip_of
+from dano.physics.real import HALF, mat33, ONE, real, vec3, ZERO
 from dano.physics.samples import position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.solids.leaves import Distance
@@ -181,8 +181,9 @@ def pull_points(
             linear = room.linear[world, k]
             where = room.where[world, k]
             point = room.points[world, k]
-            motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
-            at = slip_at(room.laws[world, k], motion.slip, linear.grip)
+            law = room.laws[world, k]
+            motion = slip_of(law, point_motion(point, twist.velocity, twist.spin))
+            at = slip_at(law, motion.slip, linear.grip)
             sample = scene.samples[world, where.sample]
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
@@ -206,6 +207,9 @@ def pull_points(
             impact_bar.delays += by_impact.delays
             impact_bar.way += by_impact.way
             impact_bar.rest += by_impact.rest
+            impact_bar.after += by_impact.after
+            impact_bar.turns.by_arm += by_impact.turns.by_arm
+            impact_bar.turns.offset += by_impact.turns.offset
             add_to_material(material_bar, by_material)
             share_bar += by_share
             h_bar += by_h
@@ -437,6 +441,8 @@ def pull_pair(
                 share_bar += (ONE - delays) * impact_bar.way
             share_bar -= delays * h * impact_bar.rest
             h_bar += (ONE - delays * found.share) * impact_bar.rest
+            share_bar -= h * impact_bar.after
+            h_bar += (HALF - found.share) * impact_bar.after
             by_delays = impact_bar.delays - wp.max(found.share, ZERO) * impact_bar.way
             by_delays -= found.share * h * impact_bar.rest
             by_delays = total(by_delays) + found.share * moment_bar.met - moment_bar.lead
@@ -445,9 +451,19 @@ def pull_pair(
         else:
             h_bar += impact_bar.rest
         bounce = scene.materials[world, index.contact].bounce
-        by_first, by_second, patch_bar, by_bounce, by_factor, by_h, _a, _b = wp.grad(impact_work)(
-            a, b, found.patch, bounce, pair.factor, h, hits, impact_bar
-        )
+        friction = scene.materials[world, index.contact].friction
+        turning = scene.body_index[index.first].turning
+        alone = bool(False)
+        if wp.static(not TREES):
+            alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
+        impact_bar.turns.by_arm = total33(impact_bar.turns.by_arm)
+        impact_bar.turns.offset = total3(impact_bar.turns.offset)
+        by_first, by_second, patch_bar, by_bounce, by_factor, by_friction, by_share_of, by_h, _a, _b, _c, _d = (
+            wp.grad(impact_work)(
+                a, b, found.patch, bounce, pair.factor, friction, found.share, h, turning, hits, alone,
+                impact_bar,
+            )
+        )  # fmt: skip
         impact_bar.factor += by_factor
         by_pose, by_share, by_h_of_patch, by_depth = pull_patch_of_impact(
             scene, room, bars, world, lane, found, pose, patch_bar
@@ -458,8 +474,10 @@ def pull_pair(
         impact_bar.depth += total(by_depth)
         if lane == 0:
             h_bar += by_h
+            share_bar += by_share_of
             if bars.materials.shape[1] > 0:
                 bars.materials[world, index.contact].bounce += by_bounce
+                bars.materials[world, index.contact].friction += by_friction
     pose_bar = total_pose(pose_bar)
     share_bar = total(share_bar) + found.impact.delays * moment_bar.met
     h_bar = total(h_bar)
