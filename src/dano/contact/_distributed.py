@@ -27,9 +27,10 @@ CHUNK = 16
 SINKING = 0.005
 IMPACT_DEPTH = 0.005
 """Depth of an impact over the size of the smaller body, at default."""
-# Where edges and faces of both bodies are known: share by which a body sinks, and least depth of an impact
-# over that of others. A face that closes over a cushion lands row by row: many small impacts lose less.
-_SHARP_SINKING, _SHARP_DEPTH = 1e-4, 2e-3
+# Where edges and faces of both bodies are known: share by which a body sinks, and depth of an impact over that
+# of others. A face that closes over a cushion lands row by row: many small impacts lose less. And what an
+# impact leaves deep is pushed out after it, the faster the deeper.
+_SHARP_SINKING, _SHARP_DEPTH = 1e-5, 5e-4
 # Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
 _SLOW = 0.2
 
@@ -164,9 +165,7 @@ class DistributedLaw(AbstractContactLaw):
         """See `AbstractContactLaw.complete`."""
         # What is left to the spring needs one.
         sharp = setting.sharp and not self.compliant
-        depth = floating(IMPACT_DEPTH * setting.size)
-        if sharp:
-            depth = _sharp_depth(setting.gravity, setting.timestep, depth)
+        depth = floating((_SHARP_DEPTH if sharp else 1.0) * IMPACT_DEPTH * setting.size)
         if params.stiffness is None:
             params = params.filled(stiffness=setting.stiffness(_SHARP_SINKING if sharp else SINKING))
         return params.filled(
@@ -183,15 +182,6 @@ class DistributedLaw(AbstractContactLaw):
 def _slow(gravity: Float[Q, ""], size: Any) -> Float[AnyArray, ""]:
     """Speed [m/s] of an impact that counts as slow for bodies of a size [m]."""
     return _SLOW * library(gravity).sqrt(gravity * SINKING * size)
-
-
-@by_numpy
-def _sharp_depth(gravity: Float[Q, ""], timestep: Float[Q, ""], depth: Float[Q, ""]) -> Float[AnyArray, ""]:
-    """Depth of an impact [m] where edges and faces of both bodies are known, from that of others.
-
-    A body that is held is taken to fall until it meets others, within a step by g h²: that is no impact.
-    """
-    return library(gravity).clip(gravity * timestep**2, _SHARP_DEPTH * depth, depth)
 
 
 def combined(a: ContactParams, b: ContactParams) -> ContactParams:

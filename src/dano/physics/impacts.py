@@ -12,8 +12,9 @@ Nothing of this depends on where in a step the bodies meet, on the number of sam
 import warp as wp
 
 from dano.physics.pairs import BodyState, FIXED, spin_of_samples
-from dano.physics.real import HALF, mat33, ONE, real, TWO, vec3, ZERO
-from dano.physics.rotations import matrix, skew
+from dano.physics.real import HALF, mat33, ONE, real, TWO, vec3, vec6, ZERO
+from dano.physics.rotations import matrix, skew, turned
+from dano.physics.twists import angular_part, joined, linear_part
 
 _FIXED = wp.constant(FIXED)
 # Least mobility along an impulse that slides, over that along the normal: what friction jams does not slide.
@@ -119,7 +120,21 @@ def delayed(impact: Impact, delays: real, share: real, h: real) -> Impact:
 
 
 @wp.func
-def patch_of_sample(area: real, sunk: real, depth: real, approach: real, arm: vec3, normal: vec3) -> Patch:
+def is_impact(approach: real, bounce: real) -> real:
+    """From 0 at a separating speed of −`bounce` [m/s] to 1 at twice that speed."""
+    return smooth_step(-approach / bounce - ONE)
+
+
+@wp.func
+def is_hit(sunk: real, depth: real, approach: real, bounce: real) -> real:
+    """From 1 down to 0 for a sample that is deeper than δ and slow: it rests, while others have an impact."""
+    return ONE - (ONE - is_impact(approach, bounce)) * smooth_step(sunk / depth)
+
+
+@wp.func
+def patch_of_sample(
+    area: real, sunk: real, depth: real, approach: real, bounce: real, arm: vec3, normal: vec3
+) -> Patch:
     """What a sample adds to a patch.
 
     Args:
@@ -127,14 +142,16 @@ def patch_of_sample(area: real, sunk: real, depth: real, approach: real, arm: ve
         sunk: Its depth where geometry is taken [m].
         depth: δ [m].
         approach: Its separating speed with which the step begins [m/s].
+        bounce: Slowest approach that is an impact [m/s].
         arm: From the first body's centre of mass [m, W].
         normal: Unit normal [W].
     """
     own = Patch()
-    own.load = area * fading_in(sunk / depth)
+    hit = area * is_hit(sunk, depth, approach, bounce)
+    own.load = hit * fading_in(sunk / depth)
     own.arm = own.load * arm
     own.normal = own.load * normal
-    own.near_load = area * fading_in(sunk / depth + ONE)
+    own.near_load = hit * fading_in(sunk / depth + ONE)
     own.near_rate = own.near_load * approach
     return own
 
@@ -144,12 +161,6 @@ def effective_inverse_mass(state: BodyState, arm: vec3, normal: vec3) -> real:
     """1/m + (r × n) · J⁻¹ (r × n): how fast a unit impulse along n makes a body's point at r [1/kg]."""
     moment = wp.cross(arm, normal)
     return state.inverse_mass + wp.dot(moment, state.inverse_inertia * moment)
-
-
-@wp.func
-def is_impact(approach: real, bounce: real) -> real:
-    """From 0 at a separating speed of −`bounce` [m/s] to 1 at twice that speed."""
-    return smooth_step(-approach / bounce - ONE)
 
 
 @wp.func
@@ -196,6 +207,62 @@ def stopping_impulse(velocity: vec3, mobility: mat33, normal: vec3, friction: re
     return (wp.max(-wp.dot(normal, velocity), ZERO) / slows) * along
 
 
+@wp.struct
+class Lever:
+    """A point of contact, as the body of a pair that moves sees it."""
+
+    body: BodyState
+    sign: real  # 1 where it is the first body, −1 where it is the second
+    arm: vec3  # From its centre of mass [m, W]
+    normal: vec3  # Unit normal, out of the other body [W]
+    mobility: mat33  # Velocity of the point by impulse at it [1/kg]
+
+
+@wp.func
+def lever_of(first: BodyState, second: BodyState, arm: vec3, normal: vec3) -> Lever:
+    """Of a point at an arm from the first body's centre of mass, with a normal of any length."""
+    at = Lever()
+    at.body = first
+    at.sign = ONE
+    at.arm = arm
+    if first.inverse_mass == ZERO:
+        at.body = second
+        at.sign = -ONE
+        at.arm = arm + first.position - second.position
+    at.normal = (at.sign / wp.max(wp.length(normal), _NOTHING)) * normal
+    across = skew(at.arm)
+    at.mobility = wp.diag(vec3(at.body.inverse_mass)) - across * at.body.inverse_inertia * across
+    return at
+
+
+@wp.func
+def turning_of(first: BodyState, second: BodyState, velocity: vec3, spin: vec3, turning: int) -> Turning:
+    """How points accelerate by turning, of a body with one that is fixed.
+
+    Args:
+        first: The sampled body.
+        second: The other.
+        velocity: Of the one that moves [m/s, W].
+        spin: Its spin [rad/s, W].
+        turning: How samples turn with their body. Those that keep facing the other body feel nothing of it.
+    """
+    found = Turning()
+    if first.inverse_mass > ZERO:
+        inverse = first.inverse_inertia
+        if turning == _FIXED:
+            found.by_arm = skew(-(inverse * wp.cross(spin, wp.inverse(inverse) * spin)))
+        axis = matrix(first.orientation) * vec3(ZERO, ZERO, ONE)
+        follows = skew(spin_of_samples(spin, axis, turning))
+        found.by_arm += follows * follows
+    else:
+        # A point of the first body is at rest, and its arm from the second one's centre changes by −v.
+        inverse = second.inverse_inertia
+        turns = skew(-(inverse * wp.cross(spin, wp.inverse(inverse) * spin)))
+        found.by_arm = skew(spin) * skew(spin) - turns
+        found.offset = found.by_arm * (first.position - second.position) + TWO * wp.cross(spin, velocity)
+    return found
+
+
 @wp.func
 def turning_after(
     first: BodyState, second: BodyState, patch: Patch, friction: real, share: real, turning: int
@@ -210,37 +277,96 @@ def turning_after(
         patch: Samples that have sunk in.
         friction: Coefficient of friction.
         share: τ.
-        turning: How samples turn with their body. Those that keep facing the other body feel nothing of it.
+        turning: How samples turn with their body.
     """
-    found = Turning()
-    normal = patch.normal / wp.max(wp.length(patch.normal), _NOTHING)
-    arm = patch.arm / patch.load
-    away = first.position - second.position
-    body = first
-    if first.inverse_mass == ZERO:
-        body = second
-        arm = arm + away
-        normal = -normal
+    at = lever_of(first, second, patch.arm / patch.load, patch.normal)
+    body = at.body
     lead = HALF + share
     v = body.velocity + lead * body.gain
     spin = body.spin + lead * body.spin_gain
-    inverse = body.inverse_inertia
-    across = skew(arm)
-    mobility = wp.diag(vec3(body.inverse_mass)) - across * inverse * across
-    impulse = stopping_impulse(v + wp.cross(spin, arm), mobility, normal, friction)
-    v = v + body.inverse_mass * impulse
-    spin = spin + inverse * wp.cross(arm, impulse)
-    turns = skew(-(inverse * wp.cross(spin, wp.inverse(inverse) * spin)))
-    if first.inverse_mass > ZERO:
-        if turning != _FIXED:
-            axis = matrix(first.orientation) * vec3(ZERO, ZERO, ONE)
-            spin = spin_of_samples(spin, axis, turning)
-            turns = mat33()
-        found.by_arm = skew(spin) * skew(spin) + turns
-    else:
-        # A point of the first body is at rest, and its arm from the second one's centre changes by −v.
-        found.by_arm = skew(spin) * skew(spin) - turns
-        found.offset = found.by_arm * away + TWO * wp.cross(spin, v)
+    impulse = stopping_impulse(v + wp.cross(spin, at.arm), at.mobility, at.normal, friction)
+    after = spin + body.inverse_inertia * wp.cross(at.arm, impulse)
+    return turning_of(first, second, v + body.inverse_mass * impulse, after, turning)
+
+
+@wp.struct
+class Rest:
+    """Sums over the samples of a pair that it rests on when a step begins, by their depth.
+
+    Attributes:
+        load: Σ A d [m³].
+        arm: [m⁴, W].
+        normal: [m³, W].
+    """
+
+    load: real
+    arm: vec3
+    normal: vec3
+
+
+@wp.func
+def rest_of_sample(area: real, depth: real, approach: real, bounce: real, arm: vec3, normal: vec3) -> Rest:
+    """What a sample adds to what a pair rests on.
+
+    Args:
+        area: Of the sample [m²].
+        depth: When the step begins [m].
+        approach: Its separating speed then [m/s].
+        bounce: Slowest approach that is an impact [m/s].
+        arm: From the first body's centre of mass [m, W].
+        normal: Unit normal [W].
+    """
+    own = Rest()
+    own.load = area * wp.max(depth, ZERO) * (ONE - is_impact(approach, bounce))
+    own.arm = own.load * arm
+    own.normal = own.load * normal
+    return own
+
+
+@wp.func
+def support_of(
+    first: BodyState, second: BodyState, rest: Rest, stiffness: real, friction: real, h: real, turning: int
+) -> vec6:
+    """Impulse of what a body rests on in a step, on the first body at its centre of mass [N s, N m s, W].
+
+    That of one point, which neither lets it sink in nor, as far as friction can, slip. It presses no more
+    than its samples do at their depth.
+
+    Args:
+        first: The sampled body.
+        second: The other; one of them is fixed.
+        rest: Samples that it rests on.
+        stiffness: k [Pa/m].
+        friction: Coefficient of friction.
+        h: Timestep [s].
+        turning: How samples turn with their body.
+    """
+    arm = rest.arm / rest.load
+    at = lever_of(first, second, arm, rest.normal)
+    turns = turning_of(first, second, at.body.velocity, at.body.spin, turning)
+    bends = at.sign * (turns.by_arm * arm + turns.offset)
+    # A velocity is that of the middle of the step before: so is the arm of what slips.
+    slips = at.body.velocity + wp.cross(at.body.spin, at.arm) - (HALF * h) * bends
+    slips = slips - wp.dot(at.normal, slips) * at.normal
+    impulse = stopping_impulse(at.body.gain + h * bends + slips, at.mobility, at.normal, friction)
+    presses = wp.dot(at.normal, impulse)
+    most = h * stiffness * rest.load
+    if presses > most:
+        impulse = (most / presses) * impulse
+    return at.sign * joined(impulse, wp.cross(arm, impulse))
+
+
+@wp.func
+def supported(body: BodyState, impulse: vec6, h: real) -> BodyState:
+    """A body that falls and is supported by an impulse at its centre of mass [N s, N m s, W]."""
+    found = body
+    if body.inverse_mass > ZERO:
+        found.gain = body.gain + body.inverse_mass * linear_part(impulse)
+        spins = body.inverse_inertia * angular_part(impulse)
+        found.spin_gain = body.spin_gain + spins
+        found.lag = body.lag + (HALF * h) * spins
+        back = wp.transpose(matrix(body.orientation))
+        found.ahead = turned(body.orientation, back * (body.spin + found.spin_gain), h)
     return found
 
 

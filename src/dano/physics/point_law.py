@@ -25,6 +25,7 @@ from dano.physics.impacts import (
     Impact,
     impact_goal,
     impact_limit,
+    is_hit,
     is_impact,
     may_rest,
     share_that_rebounds,
@@ -198,7 +199,8 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
         law.lost *= sunk
     law.extra_slip = point.extra_slip
     if impact.stiffness > ZERO:
-        law.blow = impact.part * impact.stiffness * fading_in(point.sunk / impact.depth)
+        hit = is_hit(point.sunk, impact.depth, point.approach, material.bounce)
+        law.blow = impact.part * impact.stiffness * hit * fading_in(point.sunk / impact.depth)
         law.guard = impact.part * impact.stiffness
         law.limit = impact_limit(impact, point.depth, point.sunk)
         gains = gains_of(impact, point.gains_after, point.arm, point.normal, material.friction)

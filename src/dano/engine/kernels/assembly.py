@@ -18,7 +18,6 @@ from dano.physics.point_law import (
     is_apart,
     Linear,
     linearized,
-    Motion,
     point_motion,
     slip_of,
 )

@@ -9,6 +9,7 @@ import warp as wp
 from dano.engine.kernels.lanes import lanes_where, total, total3
 from dano.engine.kernels.meeting import Meeting, meeting
 from dano.engine.kernels.near import (
+    as_they_meet,
     facing,
     is_near,
     plane_of,
@@ -33,8 +34,11 @@ from dano.physics.impacts import (
     no_impact,
     Patch,
     patch_of_sample,
+    Rest,
+    rest_of_sample,
     share_of_impact,
     stiffness_of_impact,
+    support_of,
     turning_after,
 )
 from dano.physics.pairs import (
@@ -44,7 +48,7 @@ from dano.physics.pairs import (
     speed_within,
 )
 from dano.physics.point_law import gate_of, Material, point_law
-from dano.physics.real import HALF, ONE, real, TWO, vec3, ZERO
+from dano.physics.real import HALF, ONE, real, TWO, vec3, vec6, ZERO
 from dano.physics.samples import (
     facing_area,
     is_turned,
@@ -125,6 +129,7 @@ def find_points(
     entry: int,
     share: real,
     h: real,
+    bounce: real,
     turned: bool,
     begin: int,
     end: int,
@@ -196,7 +201,7 @@ def find_points(
                             if in_patch:
                                 load += point.area * wp.max(point.sunk, ZERO)
                                 own = patch_of_sample(
-                                    point.area, point.sunk, pair.impact_depth, point.approach, point.arm,
+                                    point.area, point.sunk, pair.impact_depth, point.approach, bounce, point.arm,
                                     point.normal,
                                 )  # fmt: skip
                                 patch.load += own.load
@@ -246,6 +251,44 @@ def impact_of(
             if alone:
                 impact.turns = turning_after(a, b, patch, material.friction, found.share, turning)
     return impact
+
+
+@wp.func
+def find_rest(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, a: BodyState, b: BodyState, p: int
+) -> Rest:
+    """What a pair rests on when the step begins."""
+    rest = Rest()
+    index = scene.pair_index[p]
+    pair = scene.pairs[world, p]
+    samples = scene.body_index[index.first]
+    bounce = scene.materials[world, index.contact].bounce
+    solid = solid_of_body(scene, world, index.second)
+    h = scene.timestep[world, 0]
+    pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
+    stretch = stretch_of(scene.bodies[world, index.first], samples.turning)
+    plane = plane_of(scene, world, solid, samples.turning, pose.origin)
+    for i in range(lane, samples.blocks, _LANES):
+        block = samples.first_block + i
+        ball = scene.balls[world, block]
+        x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
+        far = reach_of_block(scene, world, pose, plane, block, stretch)
+        if solid_clearance(scene.solids, world, solid, x, far) <= far:
+            for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
+                sample = scene.samples[world, s]
+                d = solid_distance(scene.solids, world, solid, position_in_solid(pose, sample.point))
+                if d.value < ZERO and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
+                    point = point_contact(pose, sample, d, samples.turning, False, pair.share, ZERO)
+                    own = rest_of_sample(
+                        point.area, point.depth, point.approach, bounce, point.arm, point.normal
+                    )
+                    rest.load += own.load
+                    rest.arm += own.arm
+                    rest.normal += own.normal
+    rest.load = total(rest.load)
+    rest.arm = total3(rest.arm)
+    rest.normal = total3(rest.normal)
+    return rest
 
 
 @wp.func
@@ -344,6 +387,8 @@ def find_pair(
     found = FoundPair()
     found.pair = p
     found.first = at
+    found.com_difference = a.position - b.position
+    turning = scene.body_index[index.first].turning
     # Slower than this nothing has an impact.
     slow = h * material.bounce
     sink = wp.max(pair.sink, pair.impact_depth)
@@ -358,21 +403,38 @@ def find_pair(
         lasts = met.slow
     if lasts:
         met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
+    if wp.static(not TREES):
+        if alone and not lasts and met.share < ONE and met.nears:
+            # What it rests on goes on to press until it meets, and says when that is.
+            found.rest = find_rest(scene, room, world, lane, a, b, p)
+            if found.rest.load > ZERO:
+                found.falls = 1
+                seen = falling(a, 1)
+                other = falling(b, 1)
+                found.support = support_of(
+                    seen, other, found.rest, material.stiffness, material.friction, h, turning
+                )
+                seen, other = as_they_meet(a, b, found, h)
+                met = meeting(
+                    scene, room, world, lane, seen, other, pair, index.first, index.second, h,
+                    pair.impact_depth, slow, slow, -ONE,
+                )  # fmt: skip
     after = at
     again = bool(True)
     while again:
         again = False
         found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
         found.falls = wp.where(not lasts and met.nears, 1, 0)
+        if found.falls == 0:
+            found.support = vec6()
         found.critical = met.critical
         found.share = met.share
-        seen = falling(a, found.falls)
-        other = falling(b, found.falls)
+        seen, other = as_they_meet(a, b, found, h)
         pose = posed(scene, world, seen, other, index.first, index.second, met.share, h, pair.follows)
         patch = Patch()
         after, patch, load, turned_load = find_points(
             scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
-            False, at, end, patch,
+            material.bounce, False, at, end, patch,
         )  # fmt: skip
         patch.load = total(patch.load)
         patch.near_load = total(patch.near_load)
@@ -383,13 +445,11 @@ def find_pair(
         if total(turned_load) > total(load):
             after, patch, _load, _turned = find_points(
                 scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
-                True, after, end, patch,
+                material.bounce, True, after, end, patch,
             )  # fmt: skip
         found.patch = patch
-        found.com_difference = pose.com_difference
         found.impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, h)
         if not lasts:
-            turning = scene.body_index[index.first].turning
             found.impact = impact_of(seen, other, patch, material, found, pair, turning, alone)
         if not lasts and found.impact.share == ZERO:
             lasts = True
@@ -399,8 +459,7 @@ def find_pair(
                     scene, room, world, lane, a, b, pair, index.first, index.second, h, sink
                 )
             again = met.share != before or found.falls > 0
-    seen = falling(a, found.falls)
-    other = falling(b, found.falls)
+    seen, other = as_they_meet(a, b, found, h)
     found.toward = facing(scene, world, seen, other, index.first, index.second, found.share, h)
     found.end = wp.min(after, end)
     room.found[world, entry * _LANES + lane] = found

@@ -11,7 +11,9 @@ from dano.engine.kernels.derivatives.adjoint import (
     impact_work,
     pair_work,
     point_work,
+    rest_work,
     sample_distance,
+    support_work,
     Virtual,
 )
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
@@ -22,14 +24,15 @@ from dano.engine.kernels.derivatives.products import (
     scaled_body,
     scaled_leaf,
     summed_body,
+    total_body,
     total_material,
     total_pose,
 )
-from dano.engine.kernels.lanes import total, total3, total33, total6
-from dano.engine.kernels.near import posed, solid_of_body
+from dano.engine.kernels.lanes import total, total3, total6, total33
+from dano.engine.kernels.near import as_they_meet, facing, posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, UNIONS
-from dano.physics.impacts import Impact, Patch
+from dano.physics.impacts import Impact, Patch, Rest
 from dano.physics.pairs import (
     BALL,
     BodyState,
@@ -41,11 +44,11 @@ from dano.physics.pairs import (
     rotation_after,
 )
 from dano.physics.point_law import Material, point_motion, slip_at, slip_of
-from dano.physics.real import HALF, mat33, ONE, real, vec3, ZERO
-from dano.physics.samples import position_in_solid, Sample
+from dano.physics.real import HALF, mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.samples import facing_area, position_in_solid, Sample, solid_normal
 from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.solids.leaves import Distance
-from dano.physics.twists import relative_twist
+from dano.physics.twists import joined, relative_twist
 
 _BALL = wp.constant(BALL)
 
@@ -123,6 +126,8 @@ def pull_patch_of_impact(
     h_bar = real(0.0)
     depth_bar = real(0.0)
     share_of_bar = real(0.0)
+    bounce_bar = real(0.0)
+    bounce = scene.materials[world, index.contact].bounce
     for k in range(found.first, found.end):
         where = room.where[world, k]
         if room.points[world, k].sunk > -pair.impact_depth and where.presses_back == 0:
@@ -130,9 +135,20 @@ def pull_patch_of_impact(
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-            by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, _b = wp.grad(
-                impact_patch_work
-            )(pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, patch_bar)
+            (
+                by_pose,
+                by_sample,
+                by_distance,
+                _a,
+                by_share_of,
+                by_share,
+                by_h,
+                by_depth,
+                by_bounce,
+                _b,
+            ) = wp.grad(impact_patch_work)(
+                pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, bounce, patch_bar
+            )
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
             )
@@ -141,9 +157,14 @@ def pull_patch_of_impact(
             h_bar += by_h
             depth_bar += by_depth
             share_of_bar += by_share_of
+            bounce_bar += by_bounce
     share_of_bar = total(share_of_bar)
-    if lane == 0 and bars.pairs.shape[1] > 0:
-        bars.pairs[world, found.pair].share += share_of_bar
+    bounce_bar = total(bounce_bar)
+    if lane == 0:
+        if bars.pairs.shape[1] > 0:
+            bars.pairs[world, found.pair].share += share_of_bar
+        if bars.materials.shape[1] > 0:
+            bars.materials[world, index.contact].bounce += bounce_bar
     return pose_bar, share_bar, h_bar, depth_bar
 
 
@@ -390,6 +411,121 @@ def pull_pose(
     return bar
 
 
+@wp.func
+def support_twists(found: FoundPair, twists: Virtual) -> tuple[vec6, vec6]:
+    """Virtual twists of a pair's first body against its second: as they are, and of delayed impulses."""
+    along = relative_twist(twists.first_virtual, twists.second_virtual, found.com_difference)
+    late = relative_twist(twists.first_late, twists.second_late, found.com_difference)
+    return joined(along.velocity, along.spin), joined(late.velocity, late.spin)
+
+
+@wp.func
+def pull_rest(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    world: int,
+    lane: int,
+    found: FoundPair,
+    pose: PairPose,
+    rest_bar: Rest,
+) -> PairPose:
+    """Derivatives by the pose with which a step begins, from what a pair rests on; each lane's part."""
+    index = scene.pair_index[found.pair]
+    pair = scene.pairs[world, found.pair]
+    turning = scene.body_index[index.first].turning
+    bounce = scene.materials[world, index.contact].bounce
+    pose_bar = PairPose()
+    share_of_bar = real(0.0)
+    bounce_bar = real(0.0)
+    for k in range(found.first, found.end):
+        where = room.where[world, k]
+        if where.presses_back == 0:
+            sample = scene.samples[world, where.sample]
+            x = position_in_solid(pose, sample.point)
+            solid = leaf_at(scene, world, index.second, x)
+            d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
+            if d.value < ZERO and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
+                by_pose, by_sample, by_distance, _a, by_share_of, by_bounce, _b = wp.grad(rest_work)(
+                    pose, sample, d, turning, pair.share, bounce, rest_bar
+                )
+                by_pose = pull_sample(
+                    scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample,
+                    by_distance,
+                )  # fmt: skip
+                add_to_pose(pose_bar, by_pose)
+                share_of_bar += by_share_of
+                bounce_bar += by_bounce
+    share_of_bar = total(share_of_bar)
+    bounce_bar = total(bounce_bar)
+    if lane == 0:
+        if bars.pairs.shape[1] > 0:
+            bars.pairs[world, found.pair].share += share_of_bar
+        if bars.materials.shape[1] > 0:
+            bars.materials[world, index.contact].bounce += bounce_bar
+    return total_pose(pose_bar)
+
+
+@after_adjoints
+@wp.func
+def pull_support(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    world: int,
+    lane: int,
+    found: FoundPair,
+    twists: Virtual,
+    bar: PairBar,
+) -> PairBar:
+    """Derivatives by bodies that fall, from those by bodies that something supports while they do.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        bars: Added to.
+        world: Which world.
+        lane: Which lane.
+        found: The pair.
+        twists: Of its bodies.
+        bar: Derivatives by bodies as they meet, of the first lane.
+    """
+    index = scene.pair_index[found.pair]
+    pair = scene.pairs[world, found.pair]
+    material = scene.materials[world, index.contact]
+    turning = scene.body_index[index.first].turning
+    h = scene.timestep[world, 0]
+    a = falling(room.bodies[world, index.first], found.falls)
+    b = falling(room.bodies[world, index.second], found.falls)
+    share = found.impact.part * found.impact.delays
+    before = share * (HALF + found.share)
+    late = share * (HALF * found.share * found.share)
+    (
+        by_first, by_second, rest_bar, by_stiffness, by_friction, by_h, _a, _b, _c, _d, _e,
+    ) = wp.grad(support_work)(
+        a, b, found.rest, material.stiffness, material.friction, h, turning,
+        before * twists.first_virtual - late * twists.first_late,
+        before * twists.second_virtual - late * twists.second_late,
+        total_body(bar.first), total_body(bar.second),
+    )  # fmt: skip
+    start = found
+    start.share = ZERO
+    start.critical = -1
+    start.toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
+    pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
+    pose_bar = pull_rest(scene, room, bars, world, lane, found, pose, rest_bar)
+    if lane == 0:
+        of_start = pull_pose(scene, bars, world, lane, start, a, b, pose, pose_bar, ZERO, ZERO)
+        bar.first = summed_body(by_first, of_start.first)
+        bar.second = summed_body(by_second, of_start.second)
+        bar.scale += of_start.scale
+        bar.timestep += by_h + of_start.timestep
+        if bars.materials.shape[1] > 0:
+            bars.materials[world, index.contact].stiffness += by_stiffness
+            bars.materials[world, index.contact].friction += by_friction
+    return bar
+
+
 @after_adjoints
 @wp.func
 def pull_pair(
@@ -419,8 +555,7 @@ def pull_pair(
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     h = scene.timestep[world, 0]
-    a = falling(room.bodies[world, index.first], found.falls)
-    b = falling(room.bodies[world, index.second], found.falls)
+    a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
     pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
     pose_bar, share_bar, h_bar, impact_bar, twists_bar = pull_points(
         scene, room, bars, world, lane, found, pose, rebound, twists
@@ -446,6 +581,15 @@ def pull_pair(
             by_delays = impact_bar.delays - wp.max(found.share, ZERO) * impact_bar.way
             by_delays -= found.share * h * impact_bar.rest
             by_delays = total(by_delays) + found.share * moment_bar.met - moment_bar.lead
+            if wp.static(not TREES):
+                # What the pair rests on until it meets.
+                along, late = support_twists(found, twists)
+                worked = found.impact.part * wp.dot(found.support, along)
+                delayed = found.impact.part * wp.dot(found.support, late)
+                half = HALF * found.share * found.share
+                by_delays += (HALF + found.share) * worked - half * delayed
+                if lane == 0:
+                    share_bar += delays * (worked - found.share * delayed)
             if delays > ZERO:
                 impact_bar.share += by_delays
         else:
@@ -458,11 +602,11 @@ def pull_pair(
             alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
         impact_bar.turns.by_arm = total33(impact_bar.turns.by_arm)
         impact_bar.turns.offset = total3(impact_bar.turns.offset)
-        by_first, by_second, patch_bar, by_bounce, by_factor, by_friction, by_share_of, by_h, _a, _b, _c, _d = (
-            wp.grad(impact_work)(
-                a, b, found.patch, bounce, pair.factor, friction, found.share, h, turning, hits, alone,
-                impact_bar,
-            )
+        (
+            by_first, by_second, patch_bar, by_bounce, by_factor, by_friction, by_share_of, by_h, _a, _b, _c,
+            _d,
+        ) = wp.grad(impact_work)(
+            a, b, found.patch, bounce, pair.factor, friction, found.share, h, turning, hits, alone, impact_bar
         )  # fmt: skip
         impact_bar.factor += by_factor
         by_pose, by_share, by_h_of_patch, by_depth = pull_patch_of_impact(
@@ -489,6 +633,10 @@ def pull_pair(
         bar.impact_depth += impact_bar.depth
         bar.factor += impact_bar.factor
         bar.deepest += impact_bar.deepest
+    if wp.static(not TREES):
+        if wp.length_sq(found.support) > ZERO:
+            bar = pull_support(scene, room, bars, world, lane, found, twists, bar)
+    if lane == 0:
         bar.first = falling_bar(bar.first, found.falls)
         bar.second = falling_bar(bar.second, found.falls)
     bar.twists = twists_bar
