@@ -27,9 +27,10 @@ CHUNK = 16
 SINKING = 0.005
 IMPACT_DEPTH = 0.005
 """Depth of an impact over the size of the smaller body, at default."""
-# Where edges and faces of both bodies are known: share by which a body sinks, and depth of an impact over that
-# of others. A face that closes over a cushion lands row by row: many small impacts lose less. And what an
-# impact leaves deep is pushed out after it, the faster the deeper.
+# Where edges and faces of both bodies are known: share by which a body sinks, and depth of an impact over
+# that of others. A face that closes over a cushion lands row by row: many small impacts lose less. What an
+# impact leaves deep is pushed out after it. But edges that rest are less deep than one that lands, so that it
+# is the first that has an impact.
 _SHARP_SINKING, _SHARP_DEPTH = 1e-5, 5e-4
 # Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
 _SLOW = 0.2

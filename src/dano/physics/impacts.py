@@ -75,6 +75,7 @@ class Impact:
     delays: real
     way: real  # Share of the step in which bodies go on as before, all the same
     rest: real  # Time from when impulses take effect to the end of the step [s]
+    rests: real  # 1 where the pair rests on something while a part of it has the impact, else 0
     after: real  # Time from when bodies meet to the middle of the step, to which velocities belong [s]
     turns: Turning  # How points accelerate after it because their body turns
 
@@ -126,14 +127,32 @@ def is_impact(approach: real, bounce: real) -> real:
 
 
 @wp.func
-def is_hit(sunk: real, depth: real, approach: real, bounce: real) -> real:
-    """From 1 down to 0 for a sample that is deeper than δ and slow: it rests, while others have an impact."""
-    return ONE - (ONE - is_impact(approach, bounce)) * smooth_step(sunk / depth)
+def is_hit(sunk: real, depth: real, approach: real, bounce: real, rests: real) -> real:
+    """Share of a sample that has part in an impact: 0 where it is slow and rests, while others have one.
+
+    Of a pair that rests on something those that are slow do, of others those that are deeper than δ.
+
+    Args:
+        sunk: Depth of the sample where geometry is taken [m].
+        depth: δ [m].
+        approach: Its separating speed with which the step begins [m/s].
+        bounce: Slowest approach that is an impact [m/s].
+        rests: 1 where the pair rests on something, else 0.
+    """
+    lies = wp.max(rests, smooth_step(sunk / depth))
+    return ONE - (ONE - is_impact(approach, bounce)) * lies
 
 
 @wp.func
 def patch_of_sample(
-    area: real, sunk: real, depth: real, approach: real, bounce: real, arm: vec3, normal: vec3
+    area: real,
+    sunk: real,
+    depth: real,
+    approach: real,
+    bounce: real,
+    rests: real,
+    arm: vec3,
+    normal: vec3,
 ) -> Patch:
     """What a sample adds to a patch.
 
@@ -143,11 +162,12 @@ def patch_of_sample(
         depth: δ [m].
         approach: Its separating speed with which the step begins [m/s].
         bounce: Slowest approach that is an impact [m/s].
+        rests: 1 where the pair rests on something, else 0.
         arm: From the first body's centre of mass [m, W].
         normal: Unit normal [W].
     """
     own = Patch()
-    hit = area * is_hit(sunk, depth, approach, bounce)
+    hit = area * is_hit(sunk, depth, approach, bounce, rests)
     own.load = hit * fading_in(sunk / depth)
     own.arm = own.load * arm
     own.normal = own.load * normal
@@ -305,19 +325,22 @@ class Rest:
 
 
 @wp.func
-def rest_of_sample(area: real, depth: real, approach: real, bounce: real, arm: vec3, normal: vec3) -> Rest:
+def rest_of_sample(
+    area: real, depth: real, least: real, approach: real, bounce: real, arm: vec3, normal: vec3
+) -> Rest:
     """What a sample adds to what a pair rests on.
 
     Args:
         area: Of the sample [m²].
         depth: When the step begins [m].
+        least: What is no further away than this counts: steps keep depths to some error only [m].
         approach: Its separating speed then [m/s].
         bounce: Slowest approach that is an impact [m/s].
         arm: From the first body's centre of mass [m, W].
         normal: Unit normal [W].
     """
     own = Rest()
-    own.load = area * wp.max(depth, ZERO) * (ONE - is_impact(approach, bounce))
+    own.load = area * wp.max(depth + least, ZERO) * (ONE - is_impact(approach, bounce))
     own.arm = own.load * arm
     own.normal = own.load * normal
     return own

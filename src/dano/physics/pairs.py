@@ -40,8 +40,8 @@ class BodyState:
     spin_gain: vec3  # What gyroscopic torque adds to the spin within the step [rad/s, W]; the same
     falls: vec3  # `gain` without what supports the body [m/s, W]
     ahead_falling: quat  # Orientation at the end of the step with that gain; unused where there are joints
-    # Half of what the spin gains turns it by in a step [rad, W]: after a share τ it has turned by τ (1 − τ) of
-    # this less than the way to `ahead` says.
+    # Half of what the spin gains turns it by in a step [rad, W]: after a share τ it has turned by τ (1 − τ)
+    # of this less than the way to `ahead` says.
     lag: vec3
     com: vec3  # Centre of mass in the field frame [m, F]
     inverse_mass: real  # Effective inverse mass [1/kg], zero for a fixed body

@@ -119,6 +119,12 @@ def is_near(
 
 
 @wp.func
+def rests_on(found: FoundPair) -> real:
+    """Whether a pair rests on something while it nears an impact: 1 or 0."""
+    return wp.where(wp.length_sq(found.support) > ZERO, ONE, ZERO)
+
+
+@wp.func
 def as_they_meet(a: BodyState, b: BodyState, found: FoundPair, h: real) -> tuple[BodyState, BodyState]:
     """Bodies of a pair with what their velocities gain until they meet: by gravity, and what they rest on."""
     first = falling(a, found.falls)

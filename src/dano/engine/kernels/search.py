@@ -15,6 +15,7 @@ from dano.engine.kernels.near import (
     plane_of,
     posed,
     reach_of_block,
+    rests_on,
     solid_of_body,
     stretch_of,
 )
@@ -130,6 +131,7 @@ def find_points(
     share: real,
     h: real,
     bounce: real,
+    rests: real,
     turned: bool,
     begin: int,
     end: int,
@@ -201,8 +203,8 @@ def find_points(
                             if in_patch:
                                 load += point.area * wp.max(point.sunk, ZERO)
                                 own = patch_of_sample(
-                                    point.area, point.sunk, pair.impact_depth, point.approach, bounce, point.arm,
-                                    point.normal,
+                                    point.area, point.sunk, pair.impact_depth, point.approach, bounce,
+                                    rests, point.arm, point.normal,
                                 )  # fmt: skip
                                 patch.load += own.load
                                 patch.arm += own.arm
@@ -248,6 +250,7 @@ def impact_of(
             )
             delays = wp.where(alone, impact.share, ZERO)
             impact = delayed(impact, delays, found.share, material.timestep)
+            impact.rests = rests_on(found)
             if alone:
                 impact.turns = turning_after(a, b, patch, material.friction, found.share, turning)
     return impact
@@ -272,16 +275,17 @@ def find_rest(
         block = samples.first_block + i
         ball = scene.balls[world, block]
         x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
-        far = reach_of_block(scene, world, pose, plane, block, stretch)
+        far = pair.impact_depth + reach_of_block(scene, world, pose, plane, block, stretch)
         if solid_clearance(scene.solids, world, solid, x, far) <= far:
             for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
                 sample = scene.samples[world, s]
                 d = solid_distance(scene.solids, world, solid, position_in_solid(pose, sample.point))
-                if d.value < ZERO and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
+                if d.value < pair.impact_depth and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
                     point = point_contact(pose, sample, d, samples.turning, False, pair.share, ZERO)
                     own = rest_of_sample(
-                        point.area, point.depth, point.approach, bounce, point.arm, point.normal
-                    )
+                        point.area, point.depth, pair.impact_depth, point.approach, bounce, point.arm,
+                        point.normal,
+                    )  # fmt: skip
                     rest.load += own.load
                     rest.arm += own.arm
                     rest.normal += own.normal
@@ -429,12 +433,13 @@ def find_pair(
             found.support = vec6()
         found.critical = met.critical
         found.share = met.share
+        rests = rests_on(found)
         seen, other = as_they_meet(a, b, found, h)
         pose = posed(scene, world, seen, other, index.first, index.second, met.share, h, pair.follows)
         patch = Patch()
         after, patch, load, turned_load = find_points(
             scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
-            material.bounce, False, at, end, patch,
+            material.bounce, rests, False, at, end, patch,
         )  # fmt: skip
         patch.load = total(patch.load)
         patch.near_load = total(patch.near_load)
@@ -445,7 +450,7 @@ def find_pair(
         if total(turned_load) > total(load):
             after, patch, _load, _turned = find_points(
                 scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
-                material.bounce, True, after, end, patch,
+                material.bounce, rests, True, after, end, patch,
             )  # fmt: skip
         found.patch = patch
         found.impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, h)

@@ -215,7 +215,9 @@ def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, b
             inertia = turned_inertia(matrix(q), body.inertia)
             gain = gain_of_row(body, row, h)
             ahead_falling = turned(q, row.omega + gain, h)
-            total += h * wp.dot(bar.gain + bar.falls, gravity) + wp.dot(bar.spin_gain + (HALF * h) * bar.lag, matrix(q) * gain)
+            total += h * wp.dot(bar.gain + bar.falls, gravity) + wp.dot(
+                bar.spin_gain + (HALF * h) * bar.lag, matrix(q) * gain
+            )
             total += bar.inverse_mass / body.mass + wp.ddot(bar.inverse_inertia, wp.inverse(inertia))
     return total + wp.dot(bar.ahead, ahead) + wp.dot(bar.ahead_falling, ahead_falling)
 
@@ -255,11 +257,14 @@ def impact_patch_work(
     h: real,
     depth: real,
     bounce: real,
+    rests: real,
     bar: Patch,
 ) -> real:
     """⟨bar, what a sample adds to the patch of an impact⟩."""
     point = point_contact(pose, sample, d, turning, False, stiffness_share, share * h)
-    own = patch_of_sample(point.area, point.sunk, depth, point.approach, bounce, point.arm, point.normal)
+    own = patch_of_sample(
+        point.area, point.sunk, depth, point.approach, bounce, rests, point.arm, point.normal
+    )
     return (
         bar.load * own.load
         + wp.dot(bar.arm, own.arm)
@@ -296,11 +301,18 @@ def impact_work(
 
 @wp.func
 def rest_work(
-    pose: PairPose, sample: Sample, d: Distance, turning: int, stiffness_share: real, bounce: real, bar: Rest
+    pose: PairPose,
+    sample: Sample,
+    d: Distance,
+    turning: int,
+    stiffness_share: real,
+    least: real,
+    bounce: real,
+    bar: Rest,
 ) -> real:
     """⟨bar, what a sample adds to what a pair rests on⟩."""
     point = point_contact(pose, sample, d, turning, False, stiffness_share, ZERO)
-    own = rest_of_sample(point.area, point.depth, point.approach, bounce, point.arm, point.normal)
+    own = rest_of_sample(point.area, point.depth, least, point.approach, bounce, point.arm, point.normal)
     return bar.load * own.load + wp.dot(bar.arm, own.arm) + wp.dot(bar.normal, own.normal)
 
 

@@ -29,7 +29,7 @@ from dano.engine.kernels.derivatives.products import (
     total_pose,
 )
 from dano.engine.kernels.lanes import total, total3, total6, total33
-from dano.engine.kernels.near import as_they_meet, facing, posed, solid_of_body
+from dano.engine.kernels.near import as_they_meet, facing, posed, rests_on, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, UNIONS
 from dano.physics.impacts import Impact, Patch, Rest
@@ -136,19 +136,11 @@ def pull_patch_of_impact(
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             (
-                by_pose,
-                by_sample,
-                by_distance,
-                _a,
-                by_share_of,
-                by_share,
-                by_h,
-                by_depth,
-                by_bounce,
-                _b,
+                by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, by_bounce, _b, _c,
             ) = wp.grad(impact_patch_work)(
-                pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, bounce, patch_bar
-            )
+                pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, bounce,
+                rests_on(found), patch_bar,
+            )  # fmt: skip
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
             )
@@ -429,13 +421,14 @@ def pull_rest(
     found: FoundPair,
     pose: PairPose,
     rest_bar: Rest,
-) -> PairPose:
-    """Derivatives by the pose with which a step begins, from what a pair rests on; each lane's part."""
+) -> tuple[PairPose, real]:
+    """Derivatives by the pose with which a step begins and δ, from what a pair rests on."""
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
     bounce = scene.materials[world, index.contact].bounce
     pose_bar = PairPose()
+    least_bar = real(0.0)
     share_of_bar = real(0.0)
     bounce_bar = real(0.0)
     for k in range(found.first, found.end):
@@ -445,10 +438,10 @@ def pull_rest(
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-            if d.value < ZERO and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
-                by_pose, by_sample, by_distance, _a, by_share_of, by_bounce, _b = wp.grad(rest_work)(
-                    pose, sample, d, turning, pair.share, bounce, rest_bar
-                )
+            if d.value < pair.impact_depth and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
+                by_pose, by_sample, by_distance, _a, by_share_of, by_least, by_bounce, _b = wp.grad(
+                    rest_work
+                )(pose, sample, d, turning, pair.share, pair.impact_depth, bounce, rest_bar)
                 by_pose = pull_sample(
                     scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample,
                     by_distance,
@@ -456,6 +449,7 @@ def pull_rest(
                 add_to_pose(pose_bar, by_pose)
                 share_of_bar += by_share_of
                 bounce_bar += by_bounce
+                least_bar += by_least
     share_of_bar = total(share_of_bar)
     bounce_bar = total(bounce_bar)
     if lane == 0:
@@ -463,7 +457,7 @@ def pull_rest(
             bars.pairs[world, found.pair].share += share_of_bar
         if bars.materials.shape[1] > 0:
             bars.materials[world, index.contact].bounce += bounce_bar
-    return total_pose(pose_bar)
+    return total_pose(pose_bar), total(least_bar)
 
 
 @after_adjoints
@@ -513,13 +507,14 @@ def pull_support(
     start.critical = -1
     start.toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
     pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
-    pose_bar = pull_rest(scene, room, bars, world, lane, found, pose, rest_bar)
+    pose_bar, least_bar = pull_rest(scene, room, bars, world, lane, found, pose, rest_bar)
     if lane == 0:
         of_start = pull_pose(scene, bars, world, lane, start, a, b, pose, pose_bar, ZERO, ZERO)
         bar.first = summed_body(by_first, of_start.first)
         bar.second = summed_body(by_second, of_start.second)
         bar.scale += of_start.scale
         bar.timestep += by_h + of_start.timestep
+        bar.impact_depth += least_bar
         if bars.materials.shape[1] > 0:
             bars.materials[world, index.contact].stiffness += by_stiffness
             bars.materials[world, index.contact].friction += by_friction
