@@ -315,11 +315,13 @@ class Rest:
 
     Attributes:
         load: Σ A d [m³].
+        depth: [m⁴].
         arm: [m⁴, W].
         normal: [m³, W].
     """
 
     load: real
+    depth: real
     arm: vec3
     normal: vec3
 
@@ -340,10 +342,18 @@ def rest_of_sample(
         normal: Unit normal [W].
     """
     own = Rest()
-    own.load = area * wp.max(depth + least, ZERO) * (ONE - is_impact(approach, bounce))
+    sunk = wp.max(depth + least, ZERO)
+    own.load = area * sunk * (ONE - is_impact(approach, bounce))
+    own.depth = own.load * sunk
     own.arm = own.load * arm
     own.normal = own.load * normal
     return own
+
+
+@wp.func
+def depth_beside(rest: Rest) -> real:
+    """Depth at which another part of a pair meets that rests on something [m]: it is the deepest then."""
+    return TWO * rest.depth / rest.load
 
 
 @wp.func

@@ -31,6 +31,7 @@ from dano.engine.kernels.tables import (
 from dano.physics.features import LANES, TREES
 from dano.physics.impacts import (
     delayed,
+    depth_beside,
     Impact,
     no_impact,
     Patch,
@@ -287,9 +288,11 @@ def find_rest(
                         point.normal,
                     )  # fmt: skip
                     rest.load += own.load
+                    rest.depth += own.depth
                     rest.arm += own.arm
                     rest.normal += own.normal
     rest.load = total(rest.load)
+    rest.depth = total(rest.depth)
     rest.arm = total3(rest.arm)
     rest.normal = total3(rest.normal)
     return rest
@@ -421,7 +424,7 @@ def find_pair(
                 seen, other = as_they_meet(a, b, found, h)
                 met = meeting(
                     scene, room, world, lane, seen, other, pair, index.first, index.second, h,
-                    pair.impact_depth, slow, slow, -ONE,
+                    depth_beside(found.rest), slow, slow, -ONE,
                 )  # fmt: skip
     after = at
     again = bool(True)

@@ -15,6 +15,7 @@ from dano.engine.kernels.tables import Body, Moment, Push, StateRow
 from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
 from dano.physics.impacts import (
+    depth_beside,
     Impact,
     Patch,
     patch_of_sample,
@@ -313,7 +314,8 @@ def rest_work(
     """⟨bar, what a sample adds to what a pair rests on⟩."""
     point = point_contact(pose, sample, d, turning, False, stiffness_share, ZERO)
     own = rest_of_sample(point.area, point.depth, least, point.approach, bounce, point.arm, point.normal)
-    return bar.load * own.load + wp.dot(bar.arm, own.arm) + wp.dot(bar.normal, own.normal)
+    sums = bar.load * own.load + bar.depth * own.depth
+    return sums + wp.dot(bar.arm, own.arm) + wp.dot(bar.normal, own.normal)
 
 
 body_product = product_of(BodyState)
@@ -332,11 +334,12 @@ def support_work(
     second_virtual: vec6,
     first_bar: BodyState,
     second_bar: BodyState,
+    depth_bar: real,
 ) -> real:
-    """Work of what a pair rests on along virtual velocities, and ⟨bars, bodies as they meet⟩."""
+    """Work of what a pair rests on along virtual velocities, and ⟨bars, bodies as they meet, their depth⟩."""
     impulse = support_of(first, second, rest, stiffness, friction, h, turning)
     back = wrench_at(impulse, first.position - second.position)
-    work = wp.dot(impulse, virtual) - wp.dot(back, second_virtual)
+    work = wp.dot(impulse, virtual) - wp.dot(back, second_virtual) + depth_bar * depth_beside(rest)
     return (
         work
         + body_product(first_bar, supported(first, impulse, h))

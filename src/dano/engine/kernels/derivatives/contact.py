@@ -63,6 +63,7 @@ class PairBar:
     timestep: real  # By h
     sink: real  # By the depth up to which predicted geometry is taken
     impact_depth: real  # By δ
+    depth_beside: real  # By the depth at which a part meets, of a pair that rests on another
     factor: real  # By F
     deepest: real  # By the depth that another part may have
     twists: Virtual  # By twists and virtual twists, of bodies on joints
@@ -387,7 +388,9 @@ def pull_pose(
             bar.second = summed_body(bar.second, scaled_body(share, of_second))
             bar.scale += share * of_scale
             bar.timestep += share * of_h
-            if found.hits > 0 or pair.impact_depth > pair.sink:
+            if found.hits > 0 and wp.length_sq(found.support) > ZERO:
+                bar.depth_beside += share
+            elif found.hits > 0 or pair.impact_depth > pair.sink:
                 bar.impact_depth += share
             else:
                 bar.sink += share
@@ -495,12 +498,12 @@ def pull_support(
     before = share * (HALF + found.share)
     late = share * (HALF * found.share * found.share)
     (
-        by_first, by_second, rest_bar, by_stiffness, by_friction, by_h, _a, _b, _c, _d, _e,
+        by_first, by_second, rest_bar, by_stiffness, by_friction, by_h, _a, _b, _c, _d, _e, _f,
     ) = wp.grad(support_work)(
         a, b, found.rest, material.stiffness, material.friction, h, turning,
         before * twists.first_virtual - late * twists.first_late,
         before * twists.second_virtual - late * twists.second_late,
-        total_body(bar.first), total_body(bar.second),
+        total_body(bar.first), total_body(bar.second), total(bar.depth_beside),
     )  # fmt: skip
     start = found
     start.share = ZERO
