@@ -19,6 +19,8 @@ from dano.physics.twists import angular_part, joined, linear_part
 _FIXED = wp.constant(FIXED)
 # Least mobility along an impulse that slides, over that along the normal: what friction jams does not slide.
 _JAMS = wp.constant(real(0.05))
+# F of impacts of edges and faces, of which none that rests has a part.
+_SHARP = wp.constant(real(1e4))
 # A length beside which nothing divides by zero [N s].
 _NOTHING = wp.constant(real(1e-30))
 # Least share of a step after an impact.
@@ -75,7 +77,7 @@ class Impact:
     delays: real
     way: real  # Share of the step in which bodies go on as before, all the same
     rest: real  # Time from when impulses take effect to the end of the step [s]
-    rests: real  # 1 where the pair rests on something while a part of it has the impact, else 0
+    rests: real  # `share_left_out` of the pair
     after: real  # Time from when bodies meet to the middle of the step, to which velocities belong [s]
     turns: Turning  # How points accelerate after it because their body turns
 
@@ -127,20 +129,15 @@ def is_impact(approach: real, bounce: real) -> real:
 
 
 @wp.func
-def is_hit(sunk: real, depth: real, approach: real, bounce: real, rests: real) -> real:
-    """Share of a sample that has part in an impact: 0 where it is slow and rests, while others have one.
-
-    Of a pair that rests on something those that are slow do, of others those that are deeper than δ.
+def is_hit(approach: real, bounce: real, rests: real) -> real:
+    """Share of a sample that has part in an impact: where a pair rests on something, slow ones have none.
 
     Args:
-        sunk: Depth of the sample where geometry is taken [m].
-        depth: δ [m].
         approach: Its separating speed with which the step begins [m/s].
         bounce: Slowest approach that is an impact [m/s].
-        rests: 1 where the pair rests on something, else 0.
+        rests: `share_left_out` of the pair.
     """
-    lies = wp.max(rests, smooth_step(sunk / depth))
-    return ONE - (ONE - is_impact(approach, bounce)) * lies
+    return ONE - (ONE - is_impact(approach, bounce)) * rests
 
 
 @wp.func
@@ -162,12 +159,12 @@ def patch_of_sample(
         depth: δ [m].
         approach: Its separating speed with which the step begins [m/s].
         bounce: Slowest approach that is an impact [m/s].
-        rests: 1 where the pair rests on something, else 0.
+        rests: `share_left_out` of the pair.
         arm: From the first body's centre of mass [m, W].
         normal: Unit normal [W].
     """
     own = Patch()
-    hit = area * is_hit(sunk, depth, approach, bounce, rests)
+    hit = area * is_hit(approach, bounce, rests)
     own.load = hit * fading_in(sunk / depth)
     own.arm = own.load * arm
     own.normal = own.load * normal
@@ -311,65 +308,89 @@ def turning_after(
 
 @wp.struct
 class Rest:
-    """Sums over the samples of a pair that it rests on when a step begins, by their depth.
+    """Sums over the samples of a pair that it rests on when a step begins, by how near they are.
 
     Attributes:
-        load: Σ A d [m³].
-        depth: [m⁴].
-        arm: [m⁴, W].
-        normal: [m³, W].
+        load: Σ w [1].
+        near: How near they are, over the depth to which bodies fall in a step [1].
+        depth: [m].
+        arm: [m, W].
+        normal: [W].
     """
 
     load: real
+    near: real
     depth: real
     arm: vec3
     normal: vec3
 
 
 @wp.func
-def rest_of_sample(
-    area: real, depth: real, least: real, approach: real, bounce: real, arm: vec3, normal: vec3
-) -> Rest:
+def fall_of(first: BodyState, second: BodyState, depth: real, h: real) -> real:
+    """How far bodies fall towards each other in a step, and δ more [m]: what is nearer is held by contact."""
+    return depth + HALF * h * wp.length(first.falls - second.falls)
+
+
+@wp.func
+def rest_of_sample(depth: real, fall: real, approach: real, bounce: real, arm: vec3, normal: vec3) -> Rest:
     """What a sample adds to what a pair rests on.
 
     Args:
-        area: Of the sample [m²].
         depth: When the step begins [m].
-        least: What is no further away than this counts: steps keep depths to some error only [m].
+        fall: What is further away than this does not count [m].
         approach: Its separating speed then [m/s].
-        bounce: Slowest approach that is an impact [m/s].
+        bounce: Slowest approach that is an impact, and slowest rebound [m/s].
         arm: From the first body's centre of mass [m, W].
         normal: Unit normal [W].
     """
     own = Rest()
-    sunk = wp.max(depth + least, ZERO)
-    own.load = area * sunk * (ONE - is_impact(approach, bounce))
-    own.depth = own.load * sunk
+    near = wp.clamp(ONE + depth / fall, ZERO, TWO)
+    slow = (ONE - is_impact(approach, bounce)) * (ONE - smooth_step(approach / bounce))
+    own.load = near * near * near * slow
+    own.near = own.load * near
+    own.depth = own.load * wp.max(depth, ZERO)
     own.arm = own.load * arm
     own.normal = own.load * normal
     return own
 
 
 @wp.func
-def depth_beside(rest: Rest) -> real:
+def share_of_rest(rest: Rest) -> real:
+    """From 0 for a pair that is too far apart to rest to 1 for one that touches."""
+    return smooth_step(rest.near / rest.load)
+
+
+@wp.func
+def share_left_out(rest: Rest, factor: real) -> real:
+    """Share of slow samples of a pair that have no part in an impact, because it rests on them.
+
+    Where an impact is deep next to what bodies sink in at rest, F is small, and they count.
+
+    Args:
+        rest: Of the pair.
+        factor: F [1].
+    """
+    return share_of_rest(rest) * wp.min(factor / _SHARP, ONE)
+
+
+@wp.func
+def depth_beside(rest: Rest, depth: real) -> real:
     """Depth at which another part of a pair meets that rests on something [m]: it is the deepest then."""
-    return TWO * rest.depth / rest.load
+    return depth + TWO * rest.depth / rest.load
 
 
 @wp.func
 def support_of(
-    first: BodyState, second: BodyState, rest: Rest, stiffness: real, friction: real, h: real, turning: int
+    first: BodyState, second: BodyState, rest: Rest, friction: real, h: real, turning: int
 ) -> vec6:
     """Impulse of what a body rests on in a step, on the first body at its centre of mass [N s, N m s, W].
 
-    That of one point, which neither lets it sink in nor, as far as friction can, slip. It presses no more
-    than its samples do at their depth.
+    That of one point, which neither lets it sink in nor, as far as friction can, slip.
 
     Args:
         first: The sampled body.
         second: The other; one of them is fixed.
         rest: Samples that it rests on.
-        stiffness: k [Pa/m].
         friction: Coefficient of friction.
         h: Timestep [s].
         turning: How samples turn with their body.
@@ -378,15 +399,13 @@ def support_of(
     at = lever_of(first, second, arm, rest.normal)
     turns = turning_of(first, second, at.body.velocity, at.body.spin, turning)
     bends = at.sign * (turns.by_arm * arm + turns.offset)
-    # A velocity is that of the middle of the step before: so is the arm of what slips.
-    slips = at.body.velocity + wp.cross(at.body.spin, at.arm) - (HALF * h) * bends
-    slips = slips - wp.dot(at.normal, slips) * at.normal
-    impulse = stopping_impulse(at.body.gain + h * bends + slips, at.mobility, at.normal, friction)
-    presses = wp.dot(at.normal, impulse)
-    most = h * stiffness * rest.load
-    if presses > most:
-        impulse = (most / presses) * impulse
-    return at.sign * joined(impulse, wp.cross(arm, impulse))
+    # A velocity is that of the middle of the step before: so is the arm of what slips or leaves.
+    moves = at.body.velocity + wp.cross(at.body.spin, at.arm) - (HALF * h) * bends
+    nears = wp.min(wp.dot(at.normal, moves), ZERO)
+    moves = moves - nears * at.normal
+    impulse = stopping_impulse(at.body.gain + h * bends + moves, at.mobility, at.normal, friction)
+    share = at.sign * share_of_rest(rest)
+    return share * joined(impulse, wp.cross(arm, impulse))
 
 
 @wp.func

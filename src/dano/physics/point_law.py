@@ -199,7 +199,7 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
         law.lost *= sunk
     law.extra_slip = point.extra_slip
     if impact.stiffness > ZERO:
-        hit = is_hit(point.sunk, impact.depth, point.approach, material.bounce, impact.rests)
+        hit = is_hit(point.approach, material.bounce, impact.rests)
         law.blow = impact.part * impact.stiffness * hit * fading_in(point.sunk / impact.depth)
         law.guard = impact.part * impact.stiffness
         law.limit = impact_limit(impact, point.depth, point.sunk)

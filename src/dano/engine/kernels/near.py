@@ -4,7 +4,7 @@ import warp as wp
 
 from dano.engine.kernels.tables import BLOCK, Body, FoundPair, Room, RUN, Scene
 from dano.physics.features import LANES, TREES
-from dano.physics.impacts import supported
+from dano.physics.impacts import share_left_out, supported
 from dano.physics.pairs import BodyState, facing_direction, falling, pair_pose, PairPose
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 from dano.physics.rotations import matrix
@@ -119,9 +119,11 @@ def is_near(
 
 
 @wp.func
-def rests_on(found: FoundPair) -> real:
-    """Whether a pair rests on something while it nears an impact: 1 or 0."""
-    return wp.where(wp.length_sq(found.support) > ZERO, ONE, ZERO)
+def left_out(found: FoundPair, factor: real) -> real:
+    """`share_left_out` of a pair, none where it rests on nothing while it nears an impact."""
+    if wp.length_sq(found.support) > ZERO:
+        return share_left_out(found.rest, factor)
+    return ZERO
 
 
 @wp.func

@@ -12,10 +12,10 @@ from dano.engine.kernels.near import (
     as_they_meet,
     facing,
     is_near,
+    left_out,
     plane_of,
     posed,
     reach_of_block,
-    rests_on,
     solid_of_body,
     stretch_of,
 )
@@ -32,6 +32,7 @@ from dano.physics.features import LANES, TREES
 from dano.physics.impacts import (
     delayed,
     depth_beside,
+    fall_of,
     Impact,
     no_impact,
     Patch,
@@ -251,7 +252,7 @@ def impact_of(
             )
             delays = wp.where(alone, impact.share, ZERO)
             impact = delayed(impact, delays, found.share, material.timestep)
-            impact.rests = rests_on(found)
+            impact.rests = left_out(found, pair.factor)
             if alone:
                 impact.turns = turning_after(a, b, patch, material.friction, found.share, turning)
     return impact
@@ -272,26 +273,26 @@ def find_rest(
     pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
     stretch = stretch_of(scene.bodies[world, index.first], samples.turning)
     plane = plane_of(scene, world, solid, samples.turning, pose.origin)
+    fall = fall_of(a, b, pair.impact_depth, h)
     for i in range(lane, samples.blocks, _LANES):
         block = samples.first_block + i
         ball = scene.balls[world, block]
         x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
-        far = pair.impact_depth + reach_of_block(scene, world, pose, plane, block, stretch)
+        far = fall + reach_of_block(scene, world, pose, plane, block, stretch)
         if solid_clearance(scene.solids, world, solid, x, far) <= far:
             for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
                 sample = scene.samples[world, s]
                 d = solid_distance(scene.solids, world, solid, position_in_solid(pose, sample.point))
-                if d.value < pair.impact_depth and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
+                if d.value < fall and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
                     point = point_contact(pose, sample, d, samples.turning, False, pair.share, ZERO)
-                    own = rest_of_sample(
-                        point.area, point.depth, pair.impact_depth, point.approach, bounce, point.arm,
-                        point.normal,
-                    )  # fmt: skip
+                    own = rest_of_sample(point.depth, fall, point.approach, bounce, point.arm, point.normal)
                     rest.load += own.load
+                    rest.near += own.near
                     rest.depth += own.depth
                     rest.arm += own.arm
                     rest.normal += own.normal
     rest.load = total(rest.load)
+    rest.near = total(rest.near)
     rest.depth = total(rest.depth)
     rest.arm = total3(rest.arm)
     rest.normal = total3(rest.normal)
@@ -418,13 +419,11 @@ def find_pair(
                 found.falls = 1
                 seen = falling(a, 1)
                 other = falling(b, 1)
-                found.support = support_of(
-                    seen, other, found.rest, material.stiffness, material.friction, h, turning
-                )
+                found.support = support_of(seen, other, found.rest, material.friction, h, turning)
                 seen, other = as_they_meet(a, b, found, h)
                 met = meeting(
                     scene, room, world, lane, seen, other, pair, index.first, index.second, h,
-                    depth_beside(found.rest), slow, slow, -ONE,
+                    depth_beside(found.rest, pair.impact_depth), slow, slow, -ONE,
                 )  # fmt: skip
     after = at
     again = bool(True)
@@ -436,7 +435,7 @@ def find_pair(
             found.support = vec6()
         found.critical = met.critical
         found.share = met.share
-        rests = rests_on(found)
+        rests = left_out(found, pair.factor)
         seen, other = as_they_meet(a, b, found, h)
         pose = posed(scene, world, seen, other, index.first, index.second, met.share, h, pair.follows)
         patch = Patch()

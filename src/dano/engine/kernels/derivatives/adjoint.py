@@ -16,11 +16,13 @@ from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
 from dano.physics.impacts import (
     depth_beside,
+    fall_of,
     Impact,
     Patch,
     patch_of_sample,
     Rest,
     rest_of_sample,
+    share_left_out,
     share_of_impact,
     stiffness_of_impact,
     support_of,
@@ -302,19 +304,22 @@ def impact_work(
 
 @wp.func
 def rest_work(
+    first: BodyState,
+    second: BodyState,
     pose: PairPose,
     sample: Sample,
     d: Distance,
     turning: int,
-    stiffness_share: real,
-    least: real,
+    depth: real,
+    h: real,
     bounce: real,
     bar: Rest,
 ) -> real:
     """⟨bar, what a sample adds to what a pair rests on⟩."""
-    point = point_contact(pose, sample, d, turning, False, stiffness_share, ZERO)
-    own = rest_of_sample(point.area, point.depth, least, point.approach, bounce, point.arm, point.normal)
-    sums = bar.load * own.load + bar.depth * own.depth
+    point = point_contact(pose, sample, d, turning, False, ONE, ZERO)
+    fall = fall_of(first, second, depth, h)
+    own = rest_of_sample(point.depth, fall, point.approach, bounce, point.arm, point.normal)
+    sums = bar.load * own.load + bar.near * own.near + bar.depth * own.depth
     return sums + wp.dot(bar.arm, own.arm) + wp.dot(bar.normal, own.normal)
 
 
@@ -326,7 +331,7 @@ def support_work(
     first: BodyState,
     second: BodyState,
     rest: Rest,
-    stiffness: real,
+    depth: real,
     friction: real,
     h: real,
     turning: int,
@@ -335,11 +340,14 @@ def support_work(
     first_bar: BodyState,
     second_bar: BodyState,
     depth_bar: real,
+    factor: real,
+    rests_bar: real,
 ) -> real:
     """Work of what a pair rests on along virtual velocities, and ⟨bars, bodies as they meet, their depth⟩."""
-    impulse = support_of(first, second, rest, stiffness, friction, h, turning)
+    impulse = support_of(first, second, rest, friction, h, turning)
     back = wrench_at(impulse, first.position - second.position)
-    work = wp.dot(impulse, virtual) - wp.dot(back, second_virtual) + depth_bar * depth_beside(rest)
+    work = wp.dot(impulse, virtual) - wp.dot(back, second_virtual) + depth_bar * depth_beside(rest, depth)
+    work += rests_bar * share_left_out(rest, factor)
     return (
         work
         + body_product(first_bar, supported(first, impulse, h))

@@ -29,10 +29,10 @@ from dano.engine.kernels.derivatives.products import (
     total_pose,
 )
 from dano.engine.kernels.lanes import total, total3, total6, total33
-from dano.engine.kernels.near import as_they_meet, facing, posed, rests_on, solid_of_body
+from dano.engine.kernels.near import as_they_meet, facing, left_out, posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, UNIONS
-from dano.physics.impacts import Impact, Patch, Rest
+from dano.physics.impacts import fall_of, Impact, Patch, Rest
 from dano.physics.pairs import (
     BALL,
     BodyState,
@@ -116,8 +116,8 @@ def pull_patch_of_impact(
     found: FoundPair,
     pose: PairPose,
     patch_bar: Patch,
-) -> tuple[PairPose, real, real, real]:
-    """Derivatives by the pose of a pair, τ, h and δ from the patch of its impact; each lane's part."""
+) -> tuple[PairPose, real, real, real, real]:
+    """Derivatives by the pose of a pair, τ, h, δ and `left_out` from the patch of its impact, by lanes."""
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
@@ -126,6 +126,7 @@ def pull_patch_of_impact(
     share_bar = real(0.0)
     h_bar = real(0.0)
     depth_bar = real(0.0)
+    rests_bar = real(0.0)
     share_of_bar = real(0.0)
     bounce_bar = real(0.0)
     bounce = scene.materials[world, index.contact].bounce
@@ -137,10 +138,11 @@ def pull_patch_of_impact(
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             (
-                by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, by_bounce, _b, _c,
+                by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, by_bounce, by_rests,
+                _b,
             ) = wp.grad(impact_patch_work)(
                 pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, bounce,
-                rests_on(found), patch_bar,
+                left_out(found, pair.factor), patch_bar,
             )  # fmt: skip
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
@@ -151,6 +153,7 @@ def pull_patch_of_impact(
             depth_bar += by_depth
             share_of_bar += by_share_of
             bounce_bar += by_bounce
+            rests_bar += by_rests
     share_of_bar = total(share_of_bar)
     bounce_bar = total(bounce_bar)
     if lane == 0:
@@ -158,7 +161,7 @@ def pull_patch_of_impact(
             bars.pairs[world, found.pair].share += share_of_bar
         if bars.materials.shape[1] > 0:
             bars.materials[world, index.contact].bounce += bounce_bar
-    return pose_bar, share_bar, h_bar, depth_bar
+    return pose_bar, share_bar, h_bar, depth_bar, rests_bar
 
 
 @wp.func
@@ -222,6 +225,7 @@ def pull_points(
             impact_bar.way += by_impact.way
             impact_bar.rest += by_impact.rest
             impact_bar.after += by_impact.after
+            impact_bar.rests += by_impact.rests
             impact_bar.turns.by_arm += by_impact.turns.by_arm
             impact_bar.turns.offset += by_impact.turns.offset
             add_to_material(material_bar, by_material)
@@ -422,17 +426,22 @@ def pull_rest(
     world: int,
     lane: int,
     found: FoundPair,
+    a: BodyState,
+    b: BodyState,
     pose: PairPose,
     rest_bar: Rest,
-) -> tuple[PairPose, real]:
-    """Derivatives by the pose with which a step begins and δ, from what a pair rests on."""
+) -> tuple[PairPose, PairBar]:
+    """Derivatives by the pose with which a step begins, and by the bodies, from what a pair rests on."""
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
     bounce = scene.materials[world, index.contact].bounce
+    h = scene.timestep[world, 0]
+    fall = fall_of(a, b, pair.impact_depth, h)
     pose_bar = PairPose()
-    least_bar = real(0.0)
-    share_of_bar = real(0.0)
+    bar = PairBar()
+    first_bar = vec3()
+    second_bar = vec3()
     bounce_bar = real(0.0)
     for k in range(found.first, found.end):
         where = room.where[world, k]
@@ -441,26 +450,28 @@ def pull_rest(
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-            if d.value < pair.impact_depth and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
-                by_pose, by_sample, by_distance, _a, by_share_of, by_least, by_bounce, _b = wp.grad(
-                    rest_work
-                )(pose, sample, d, turning, pair.share, pair.impact_depth, bounce, rest_bar)
+            if d.value < fall and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
+                by_first, by_second, by_pose, by_sample, by_distance, _a, by_depth, by_h, by_bounce, _b = (
+                    wp.grad(rest_work)(a, b, pose, sample, d, turning, pair.impact_depth, h, bounce, rest_bar)
+                )
                 by_pose = pull_sample(
                     scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample,
                     by_distance,
                 )  # fmt: skip
                 add_to_pose(pose_bar, by_pose)
-                share_of_bar += by_share_of
+                first_bar += by_first.falls
+                second_bar += by_second.falls
+                bar.impact_depth += by_depth
+                bar.timestep += by_h
                 bounce_bar += by_bounce
-                least_bar += by_least
-    share_of_bar = total(share_of_bar)
+    bar.first.falls = total3(first_bar)
+    bar.second.falls = total3(second_bar)
+    bar.impact_depth = total(bar.impact_depth)
+    bar.timestep = total(bar.timestep)
     bounce_bar = total(bounce_bar)
-    if lane == 0:
-        if bars.pairs.shape[1] > 0:
-            bars.pairs[world, found.pair].share += share_of_bar
-        if bars.materials.shape[1] > 0:
-            bars.materials[world, index.contact].bounce += bounce_bar
-    return total_pose(pose_bar), total(least_bar)
+    if lane == 0 and bars.materials.shape[1] > 0:
+        bars.materials[world, index.contact].bounce += bounce_bar
+    return total_pose(pose_bar), bar
 
 
 @after_adjoints
@@ -473,6 +484,7 @@ def pull_support(
     lane: int,
     found: FoundPair,
     twists: Virtual,
+    rests_bar: real,
     bar: PairBar,
 ) -> PairBar:
     """Derivatives by bodies that fall, from those by bodies that something supports while they do.
@@ -485,6 +497,7 @@ def pull_support(
         lane: Which lane.
         found: The pair.
         twists: Of its bodies.
+        rests_bar: Derivative by `left_out`, of all lanes.
         bar: Derivatives by bodies as they meet, of the first lane.
     """
     index = scene.pair_index[found.pair]
@@ -498,28 +511,29 @@ def pull_support(
     before = share * (HALF + found.share)
     late = share * (HALF * found.share * found.share)
     (
-        by_first, by_second, rest_bar, by_stiffness, by_friction, by_h, _a, _b, _c, _d, _e, _f,
+        by_first, by_second, rest_bar, by_depth, by_friction, by_h, _a, _b, _c, _d, _e, _f, by_factor,
+        _g,
     ) = wp.grad(support_work)(
-        a, b, found.rest, material.stiffness, material.friction, h, turning,
+        a, b, found.rest, pair.impact_depth, material.friction, h, turning,
         before * twists.first_virtual - late * twists.first_late,
         before * twists.second_virtual - late * twists.second_late,
-        total_body(bar.first), total_body(bar.second), total(bar.depth_beside),
+        total_body(bar.first), total_body(bar.second), total(bar.depth_beside), pair.factor, rests_bar,
     )  # fmt: skip
     start = found
     start.share = ZERO
     start.critical = -1
     start.toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
     pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
-    pose_bar, least_bar = pull_rest(scene, room, bars, world, lane, found, pose, rest_bar)
+    pose_bar, rests = pull_rest(scene, room, bars, world, lane, found, a, b, pose, rest_bar)
     if lane == 0:
-        of_start = pull_pose(scene, bars, world, lane, start, a, b, pose, pose_bar, ZERO, ZERO)
-        bar.first = summed_body(by_first, of_start.first)
-        bar.second = summed_body(by_second, of_start.second)
+        of_start = pull_pose(scene, bars, world, lane, start, a, b, pose, pose_bar, ZERO, rests.timestep)
+        bar.first = summed_body(summed_body(by_first, of_start.first), rests.first)
+        bar.second = summed_body(summed_body(by_second, of_start.second), rests.second)
         bar.scale += of_start.scale
         bar.timestep += by_h + of_start.timestep
-        bar.impact_depth += least_bar
+        bar.impact_depth += by_depth + rests.impact_depth
+        bar.factor += by_factor
         if bars.materials.shape[1] > 0:
-            bars.materials[world, index.contact].stiffness += by_stiffness
             bars.materials[world, index.contact].friction += by_friction
     return bar
 
@@ -563,6 +577,7 @@ def pull_pair(
     impact_bar.depth = total(impact_bar.depth)
     impact_bar.factor = total(impact_bar.factor)
     impact_bar.deepest = total(impact_bar.deepest)
+    rests_bar = real(0.0)
     if found.impact.share > ZERO:
         impact_bar.share = total(impact_bar.share)
         impact_bar.stiffness = total(impact_bar.stiffness)
@@ -607,13 +622,14 @@ def pull_pair(
             a, b, found.patch, bounce, pair.factor, friction, found.share, h, turning, hits, alone, impact_bar
         )  # fmt: skip
         impact_bar.factor += by_factor
-        by_pose, by_share, by_h_of_patch, by_depth = pull_patch_of_impact(
+        by_pose, by_share, by_h_of_patch, by_depth, by_rests = pull_patch_of_impact(
             scene, room, bars, world, lane, found, pose, patch_bar
         )
         add_to_pose(pose_bar, by_pose)
         share_bar += by_share
         h_bar += by_h_of_patch
         impact_bar.depth += total(by_depth)
+        rests_bar = total(by_rests) + total(impact_bar.rests)
         if lane == 0:
             h_bar += by_h
             share_bar += by_share_of
@@ -633,7 +649,7 @@ def pull_pair(
         bar.deepest += impact_bar.deepest
     if wp.static(not TREES):
         if wp.length_sq(found.support) > ZERO:
-            bar = pull_support(scene, room, bars, world, lane, found, twists, bar)
+            bar = pull_support(scene, room, bars, world, lane, found, twists, rests_bar, bar)
     if lane == 0:
         bar.first = falling_bar(bar.first, found.falls)
         bar.second = falling_bar(bar.second, found.falls)
