@@ -33,6 +33,36 @@ from dano.physics.real import HALF, ONE, real, vec3, ZERO
 _SPREAD = wp.constant(real(1.5))
 # Least of the factor of normals, so that a sample against which all heads are turned goes somewhere.
 _AGAINST = wp.constant(real(1e-3))
+# Length of the sum of what faces one direction over the sum of lengths, at least.
+_PARALLEL = wp.constant(real(0.9999))
+# Share of the mean depth from which on samples of flat faces score by their area alone.
+_SHALLOW = wp.constant(real(0.25))
+
+
+@wp.func
+def set_scores(work: wp.ref[Work], begin: int, end: int):
+    """Say of each sample how it scores as a head: by its load, and where flat faces meet by its area.
+
+    There all samples are about as deep, and loads would change places at each tremble.
+    """
+    weight = ZERO
+    area = ZERO
+    flat = ZERO
+    along = vec3()
+    for i in range(begin, end):
+        touch = work.touches[i]
+        weight += touch.weight
+        area += touch.area
+        along += touch.area * touch.normal
+        if touch.flat == 1:
+            flat += touch.area
+    # Most of what touches is flat, and all of it faces one direction.
+    are_flat = flat > HALF * area and wp.length(along) > _PARALLEL * area
+    for i in range(begin, end):
+        load = work.touches[i].weight
+        if are_flat:
+            load = wp.min(load, _SHALLOW * work.touches[i].area * weight / area)
+        work.touches[i].score = load * work.touches[i].precedence
 
 
 @wp.func
@@ -41,7 +71,7 @@ def too_low(work: wp.ref[Work], begin: int, end: int, most: int) -> real:
     for k in range(most + 1):
         work.scores[k] = ZERO
     for i in range(begin, end):
-        score = work.touches[i].weight * work.touches[i].precedence
+        score = work.touches[i].score
         k = int(most)
         if score > work.scores[k]:
             while k > 0 and score > work.scores[wp.max(k - 1, 0)]:
@@ -82,7 +112,7 @@ def find_heads(work: wp.ref[Work], begin: int, end: int, most: int) -> int:
     low = too_low(work, begin, end, most)
     heads = int(0)
     for i in range(begin, end):
-        score = work.touches[i].weight * work.touches[i].precedence
+        score = work.touches[i].score
         kept = ZERO
         if score > low:
             kept = ONE - low / score
@@ -218,6 +248,7 @@ def merge(
             write(work, at, touch, touch.presses == 1, settings, a, b, sink, options)
             at += 1
         return at
+    set_scores(work, begin, end)
     heads = find_heads(work, begin, end, most)
     near = _SPREAD * spread_of(work.touches, begin, end) / real(most)
     for i in range(begin, end):
