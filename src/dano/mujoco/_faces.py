@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dano.fields import SignedDistanceGrid
 from dano.objects import flat_faces, NeuralObject
@@ -55,10 +55,10 @@ class Faces(NamedTuple):
             planes=_moved(self.planes, rotation, origin),
         )
 
-    def facing(
+    def around(
         self, points: Float[np.ndarray, "n 3"], vectors: Float[np.ndarray, "n 3"]
-    ) -> Float[np.ndarray, "n 3"]:
-        """Normal of the face that each sample lies within; zero on edges and elsewhere.
+    ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+        """Normal of the face that each sample lies within, zero for others, and which lie on edges of faces.
 
         Args:
             points: Samples [m].
@@ -71,7 +71,7 @@ class Faces(NamedTuple):
         within = on & along & (on.sum(axis=1, keepdims=True) == 1) & (areas[:, None] > 0)
         rows, columns = np.nonzero(within)
         found[rows] = self.planes[columns, :3]
-        return found
+        return found, on.any(axis=1) & ~within.any(axis=1)
 
 
 def faces_of(obj: NeuralObject) -> Faces:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dano.mujoco._settings import is_gap_beyond, Settings
 from dano.mujoco._solids import Geom, object_solid, Solid
@@ -152,6 +152,7 @@ def _arrays(
         counts = [len(face.edges) for face in faces]
         flat["plane"], flat["count"] = np.array([face.plane for face in faces]), counts
         flat["first"] = np.cumsum([0, *counts[:-1]])
+    on_faces = [_on_faces(part) for part in parts if part.surface is not None]
     touching = like.rows("known.pairs", len(pairs))
     touching["first"], touching["second"] = pairs.T
     touching["both"] = [not _is_flat(parts[a], parts[b]) for a, b in pairs]
@@ -161,7 +162,8 @@ def _arrays(
         "runs": [np.zeros((0, 4)), *(each.runs for each in sampled)],
         "planes": [np.zeros((0, 4)), *planes],
         "edges": [np.zeros((0, 4)), *(face.edges for face in faces)],
-        "facing": [np.zeros((0, 3)), *(_facing(part) for part in parts if part.surface is not None)],
+        "facing": [np.zeros((0, 3)), *(facing for facing, _ in on_faces)],
+        "rim": [np.zeros(0), *(rim for _, rim in on_faces)],
         "sizes": [np.asarray(sizes)],
     }
     found = {"parts": numbers, "index": index, "pairs": touching, "samples": samples, "faces": flat}
@@ -171,12 +173,13 @@ def _arrays(
     return {**{f"known.{name}": values for name, values in found.items()}, **solids}
 
 
-def _facing(part: Part) -> Float[np.ndarray, "n 3"]:
-    """Normals of the faces that samples lie within, see `Faces.facing`."""
+def _on_faces(part: Part) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Normals of the faces that samples lie within, and which lie on edges: see `Faces.around`."""
     assert part.surface is not None
+    n = len(part.surface.points)
     if part.thing is None:
-        return np.zeros((len(part.surface.points), 3))
-    return part.thing.faces.facing(part.surface.points, part.surface.vectors)
+        return np.zeros((n, 3)), np.zeros(n, bool)
+    return part.thing.faces.around(part.surface.points, part.surface.vectors)
 
 
 def _grain(part: Part) -> float:

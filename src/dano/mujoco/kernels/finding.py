@@ -197,6 +197,18 @@ def pressed_normal(pose: PairPose, solid: int, facing: vec3, normal: vec3, flat:
     return found, of_face
 
 
+@wp.func(inline=True)
+def slope_of(own: vec3, normal: vec3) -> vec3:
+    """How the height of a surface over a plane grows along it [1].
+
+    Args:
+        own: Along the outward normal of the surface, towards the plane.
+        normal: Of the plane.
+    """
+    along = wp.dot(own, normal)
+    return (own - along * normal) / wp.max(-along, real(1e-30))
+
+
 @wp.func
 def meeting(known: wp.ref[Known], model: wp.ref[Model], side: Side, sink: real, way: real, h: real) -> real:
     """Share of the step after which the first sample has sunk in by `sink`; 1 if none does within the step.
@@ -342,6 +354,15 @@ def list_side(
                             touch.weight = area * depth
                             touch.area = area
                             touch.flat = wp.min(flat, 1)
+                            on_face = wp.dot(known.facing[s], known.facing[s]) > ZERO
+                            # What is round on what is flat, either of which may be that of the sample.
+                            if flat == 2 or (flat == 1 and known.rim[s] == 0 and not on_face):
+                                own = pose.points * sample.area
+                                if flat == 2:
+                                    own = -solid_normal(d.gradient)
+                                if side.index.turning == 0 or flat == 2:
+                                    touch.flat = 2
+                                    touch.slope = rotation_after(side.b, ZERO) * slope_of(own, normal)
                             touch.precedence = known.precedence[s]
                             touch.presses = wp.where(early or over < ZERO, 1, 0)
                             work.touches[at] = touch

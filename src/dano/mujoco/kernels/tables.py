@@ -97,6 +97,7 @@ class Known:
     faces: wp.array(dtype=Face)  # Of objects
     edges: wp.array(dtype=vec4)  # Planes through the edges of faces
     facing: wp.array(dtype=vec3)  # Normal of the face that each sample lies within, zero for none
+    rim: wp.array(dtype=wp.int32)  # 1 where it lies on the edge of a face
     sizes: wp.array(dtype=vec3)  # Of the geoms when this was made [m], shape (geoms,)
 
 
@@ -182,20 +183,22 @@ class Touch:
         weight: Its area times its depth at the end of the step, or now if that is more [m³].
         position: Between the two surfaces [m, W].
         normal: From the first part to the second [W].
+        slope: How the gap grows along the face, of flat ones [1, W].
         gap: Between the surfaces, negative where they overlap [m].
         nearing: Speed at which the gap closes [m/s].
         area: What of the sample's area faces the other body [m²].
-        score: See `dano.mujoco.kernels.merging`.
+        score: How much it counts as a head of others, see `dano.mujoco.kernels.merging`.
         precedence: See `Known`.
         kept: Share of its weight that it keeps.
         drawn: How much heads draw it; both see `dano.mujoco.kernels.merging`.
         presses: 0 where it only counts as near.
-        flat: 1 where the normal is that of a flat face of an object.
+        flat: 1 where the normal is that of a flat face of an object, 2 where what is round presses on it.
     """
 
     weight: real
     position: vec3
     normal: vec3
+    slope: vec3
     gap: real
     nearing: real
     area: real
