@@ -49,7 +49,7 @@ _SHALLOW = wp.constant(real(0.25))
 
 @wp.func
 def flatness(touches: wp.array(dtype=Touch), begin: int, end: int) -> int:
-    """1 where most of what touches is flat, all of it in one direction; 2 where it is round on a flat face."""
+    """1 where most of what touches is flat, in one direction; 2 where what is round lies on a flat face."""
     area = ZERO
     flat = ZERO
     round = ZERO
@@ -397,6 +397,16 @@ def merge(
     for k in range(heads):
         touch, samples = led_touch(work, work.heads[k], begin, end, near)
         touch = lowest(touch, bulge)
-        write(work, at, touch, touch.presses == 1, in_parallel(settings, samples), a, b, sink, options)
+        write(
+            work,
+            at,
+            touch,
+            touch.presses == 1,
+            in_parallel(settings, samples, flat == 1),
+            a,
+            b,
+            sink,
+            options,
+        )
         at += 1
     return at
