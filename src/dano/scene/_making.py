@@ -71,7 +71,9 @@ def sampled_alike(bodies: Sequence[Body], twins: Sequence[int]) -> tuple[int, ..
     """For each body the first with the same samples, see `Scene.sampled`."""
     first: dict[int, int] = {}
     return tuple(
-        twins[i] if body.object is not None or body.surface is None else first.setdefault(id(body.surface), i)
+        twins[i]
+        if body.object is not None or body.surface is None
+        else first.setdefault(id(body.surface.points), i)
         for i, body in enumerate(bodies)
     )
 
