@@ -387,9 +387,9 @@ def picture(source: Source, folder: Path) -> Path:
     after = simulated(held, **{name: float(fit.values[name]) for name in PARAMETERS})
     seen = held.after[:, 3:]
     panels = [
-        (f"{words} after [{unit}]", seen[:, k], held.published[:, 4, k], after[:, k])
+        (f"{words} [{unit}]", seen[:, k], held.published[:, 4, k], after[:, k])
         for k, (words, unit) in enumerate(
             (("speed along the floor", "m/s"), ("rise", "m/s"), ("spin", "rad/s"))
         )
     ]
-    return scatter(folder / "real_impacts.png", panels, ("Wang and Mason, of the file", "dano"))
+    return scatter(folder / "real_impacts.png", panels, ("Wang and Mason, as the data set has it", "dano"))

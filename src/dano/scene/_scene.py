@@ -475,8 +475,8 @@ class Scene(eqx.Module):
         """Time [s] that an impact of two bodies takes, where it is left to the spring; to some tens of %.
 
         π √(m d/F) until it is turned round, with the mass m of both and the depth d at which the work F d/2
-        of the springs is m v²/2, for a typical orientation. A step of a fortieth of it, or less, resolves the
-        impact. As a check before a simulation: it is no number to be differentiated.
+        of the springs is m v²/2, for a typical orientation. Twenty steps of it or more resolve the impact.
+        It is a check before a simulation and cannot be differentiated.
 
         Args:
             a: One body.
