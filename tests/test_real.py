@@ -50,7 +50,7 @@ def test_impacts_of_the_scene_are_those_of_a_point(kind, ends, bounds):
     expected = impacts.after[:, 3:]
     if ends is not None:
         expected = _points.following_slip(impacts.before[:, 3:], arm, _impacts.GYRATION, 0.6, 0.2, ends=ends)
-    off = np.abs(_impacts.simulated(impacts, kind, friction=0.2, restitution=0.6) - expected)
+    off = np.abs(_impacts.simulated(impacts, friction=0.2, restitution=0.6, kind=kind) - expected)
     assert np.median(off[:, 2]) < bounds[1] and np.median(off[:, :2]) < bounds[0]
 
 
@@ -161,6 +161,18 @@ def test_a_pusher_in_the_middle_pushes_straight():
     assert np.allclose(poses[-1], [0.1, 0.0, 0.0], atol=1e-9)
     ours = _pushes.simulated([push], measuring, {"friction": 0.3, "feet": 0.04})[0]
     assert np.allclose(ours[-1], [0.1, 0.0, 0.0], atol=2e-3)
+
+
+def test_friction_shows_in_the_direction_of_a_block_that_slips():
+    n, friction = 500, 0.1
+    path = np.column_stack([np.linspace(0.0, 0.12, n), np.full(n, 0.02)])
+    measuring = {"radius": 0.005, "scale": 0.0, "x": 0.0, "y": 0.0}
+    # Where the pusher touches first.
+    start = _pushes.Push("aside", np.tile([0.0499, 0.0, 0.0], (n, 1)), path)
+    block = _pushes.quasi_static(start, measuring, {"c": 0.04, "friction": friction})
+    slips = _pushes.Push("aside", block, path).slips(measuring)
+    assert len(slips) > 5
+    np.testing.assert_allclose(slips[:, 1], friction, atol=0.01)
 
 
 def test_intervals_for_one_more_recording_hold_as_often_as_they_say():

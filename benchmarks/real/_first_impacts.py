@@ -158,9 +158,9 @@ def _met(poses: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float, float
     middle = angle + turned / 2
     tilt = np.mod(middle + quarter / 2, quarter) - quarter / 2
     height = z - GRAVITY * time**2 / 2
-    velocities = [np.array([-v[0, 1], v[1, 1] - GRAVITY * time, v[2, 1]]) for v in (one, two)]
+    before, after = (np.array([-v[0, 1], v[1, 1] - GRAVITY * time, v[2, 1]]) for v in (one, two))
     deep = -float(lowest(np.array([x, height, middle])))
-    return tilt, *velocities, float(turned), deep
+    return float(tilt), before, after, float(turned), deep
 
 
 def _flight(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:

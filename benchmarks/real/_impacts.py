@@ -77,33 +77,27 @@ def rows(source: Source | None, *, quick: bool = False) -> list[Row]:
     if quick:
         fitted = fitted.some(np.arange(60))
     group = "Impacts of an ellipse: dano"
-    found = []
-    off = {}
-    for kind, label, targets in ((IN_TIME, "", (0.56, 20.0)), (WITHIN_A_STEP, WITHIN, (None, None))):
+    found, off, constants = [], {}, {}
+    for kind, label, targets in ((WITHIN_A_STEP, WITHIN, (None, None)), (IN_TIME, "", (0.56, 20.0))):
         fit = identify(fitted, kind)
         constants = {name: float(fit.values[name]) for name in PARAMETERS}
         note = f"{source.words}; {len(held)} impacts"
-        after = simulated(held, kind, **constants)
+        after = simulated(held, **constants, kind=kind)
         off[kind] = np.linalg.norm((after - held.after[:, 3:])[:, :2], axis=1)
-        found += _errors(group, held, after, name=label, targets=targets, note=note)
+        of_kind = _errors(group, held, after, name=label, targets=targets, note=note)
         for name in PARAMETERS:
             low, high = fit.interval(name)
             words = f"{label}: {name}" if label else name
-            found.append(Row(group, words, constants[name], "", note=f"95 % {low:.3f} to {high:.3f}"))
-        if kind is IN_TIME:
-            parts, best = [] if quick else _between_parts(group, fitted, fit), constants
+            of_kind.append(Row(group, words, constants[name], "", note=f"95 % {low:.3f} to {high:.3f}"))
+        if kind is IN_TIME and not quick:
+            of_kind += _between_parts(group, fitted, fit)
+        found = of_kind + found
     less, error = _paired(off[IN_TIME], off[WITHIN_A_STEP])
     found.append(
         Row(group, "velocity error less that of impacts within a step", less, "m/s", 0.0, note=error)
     )
-    return [
-        *found,
-        *parts,
-        *_others(fitted, held),
-        *_laws(fitted, held),
-        *_repeats(held, best),
-        *_jacobian(held),
-    ]
+    others = [*_others(fitted, held), *_laws(fitted, held)]
+    return [*found, *others, *_repeats(held, constants), *_jacobian(held)]
 
 
 WITHIN = "impacts within a step"
@@ -163,9 +157,11 @@ def identify(
         )
 
 
-def simulated(impacts: Impacts, kind: Impulse = IN_TIME, **constants: float) -> np.ndarray:
+def simulated(
+    impacts: Impacts, *, friction: float, restitution: float, kind: Impulse = IN_TIME
+) -> np.ndarray:
     """Velocities after each impact by dano [m/s, rad/s], shape (n, 3)."""
-    made = scene(kind, **constants)
+    made = scene(kind, friction, restitution)
     height = arms(impacts.before[:, 2], SEMI_AXES)[1] + kind.gap
     # The joint counts z downwards, from where `position` has it.
     q = np.stack([impacts.before[:, 0], 1 - height, impacts.before[:, 2]], axis=-1)

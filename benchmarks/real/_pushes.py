@@ -38,6 +38,8 @@ SIZES = {"radius": 3e-4, "scale": 1e-3, "x": 5e-4, "y": 5e-4}
 
 OWN = ("scale", "x")
 """What of the measurement may be a recording's own."""
+# Windows [frames] in which the pusher slips faster than this [m/s]; how even they must be [m].
+_WINDOW, _SLIPS, _SMOOTH = 25, 4e-3, 5e-4
 # Pusher and block touch if they seem to be nearer than this; and how well the tracker knows it [m].
 _TOUCHES, _TRACKED = 2e-3, 2e-4
 
@@ -114,6 +116,30 @@ class Push:
             return self.overlap(values(x))[touching] / _TRACKED
 
         return values(least_squares(residuals, np.zeros(len(OWN)), x_scale=sizes, loss="soft_l1").x)
+
+    def slips(self, measuring: Mapping[str, float]) -> np.ndarray:
+        """Where the pusher slips along the block: turn of the block [rad], and friction, shape (n, 2).
+
+        Without a fit: slow support friction that is the same in all directions moves the block's middle along
+        the force, and while the pusher slips the force is on the edge of its cone. Of windows of a tenth of a
+        second, without blows and with the pusher on the face behind.
+        """
+        path, found = self.path(measuring), []
+        times = FRAME * np.arange(_WINDOW)
+        for k in range(0, len(self) - _WINDOW, _WINDOW):
+            block, pusher = self.block[k : k + _WINDOW], path[k : k + _WINDOW]
+            (at, rate), (place, moved) = (
+                np.polynomial.polynomial.polyfit(times - times.mean(), each, 1) for each in (block, pusher)
+            )
+            cosine, sine = np.cos(at[2]), np.sin(at[2])
+            turn = np.array([[cosine, sine], [-sine, cosine]])
+            contact, going, middle = turn @ (place - at[:2]), turn @ moved, turn @ rate[:2]
+            slip = going[1] - (middle[1] - rate[2] * HALF)
+            touches = abs(contact[0] + HALF + measuring["radius"]) < _SMOOTH and abs(contact[1]) < HALF
+            smooth = np.abs(block - at - np.outer(times - times.mean(), rate))[:, :2].max() < _SMOOTH
+            if touches and smooth and abs(slip) > _SLIPS and middle[0] > 2 * _SLIPS:
+                found.append((at[2], middle[1] * np.sign(slip) / middle[0]))
+        return np.array(found).reshape(-1, 2)
 
     def stretches(self) -> "list[Push]":
         """Its stretches of two seconds."""

@@ -5,7 +5,16 @@ import functools
 from pathlib import Path
 
 from benchmarks._measure import load_average, parse_arguments, parts_option, report, rows_of_parts
-from benchmarks.real import _first_impacts, _frictions, _impacts, _pushes, _round_corners, _squares, _tools
+from benchmarks.real import (
+    _first_impacts,
+    _frictions,
+    _impacts,
+    _pushes,
+    _round_corners,
+    _slips,
+    _squares,
+    _tools,
+)
 from benchmarks.real._data import data_folder, Source
 
 PARTS = {
@@ -15,6 +24,7 @@ PARTS = {
     "round-corners": _round_corners,
     "pushes": _pushes,
     "frictions": _frictions,
+    "slips": _slips,
     "tools": _tools,
 }
 

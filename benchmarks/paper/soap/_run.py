@@ -50,7 +50,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 def _draw(path: Path, fit: dano.Identification) -> None:
-    """Distance that the soap has gone over time: positions of the film, and the simulation with the friction found."""
+    """Distance of the soap over time: positions of the film, and the simulation with the friction found."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.0, 2.6), layout="constrained")
