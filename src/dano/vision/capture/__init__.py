@@ -7,9 +7,15 @@ from dano.vision.capture._camera import (
 )
 from dano.vision.capture._capture import Capture as Capture, View as View
 from dano.vision.capture._capture_files import load_camera as load_camera, load_capture as load_capture
+from dano.vision.capture._decided import (
+    decided_by_colours as decided_by_colours,
+    left_out as left_out,
+    Solid as Solid,
+)
 from dano.vision.capture._hull import (
     hull_distance as hull_distance,
     object_box as object_box,
+    spare_of as spare_of,
     viewed_ball as viewed_ball,
 )
 from dano.vision.capture._light import Light as Light
@@ -32,3 +38,4 @@ from dano.vision.capture._ray_set import (
     RaySet as RaySet,
 )
 from dano.vision.capture._rays import box_interval as box_interval, Rays as Rays
+from dano.vision.capture._shown import silhouette as silhouette

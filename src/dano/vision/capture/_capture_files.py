@@ -221,6 +221,9 @@ def _read_transforms(path: Path) -> list[View]:
         if frame.get("mask_path") not in _UNSET:
             mask = read_mask(path.parent / str(frame["mask_path"]), image.shape[:2], picture.orientation)
             image, cut_out = picture.colours, False
+        doubt = None
+        if frame.get("doubt_path") not in _UNSET:
+            doubt = read_mask(path.parent / str(frame["doubt_path"]), image.shape[:2], picture.orientation)
         light, near = _light(path, i, frame)
         views.append(
             View(
@@ -228,6 +231,7 @@ def _read_transforms(path: Path) -> list[View]:
                 camera=_camera(path, name, values, image.shape[:2]),
                 image=image,
                 mask=mask,
+                doubt=doubt,
                 light=light,
                 light_is_near=near,
                 split=_split(path, i, frame.get("split", named.get(name, "train"))),
