@@ -33,7 +33,7 @@ class Grade(NamedTuple):
     @property
     def text(self) -> str:
         """The number, and what is usual."""
-        return f"{self._shown(self.value)} {self.unit} ({self.mark}; up to {self._shown(self.good)} is usual)"
+        return f"{self._shown(self.value)} {self.unit} ({self.mark}; up to {self._shown(self.good)} {self.unit} is usual)"
 
     def _shown(self, value: float) -> str:
         return f"{100 * value:.3g}" if self.unit == "%" else f"{value:.3g}"

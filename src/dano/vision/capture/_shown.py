@@ -51,7 +51,7 @@ def _closest(distance: Array, origin: Array, spacing: Array, rays: Array, angle:
 
     def closer(least: Array, share: Array) -> tuple[Array, None]:
         depth = near + share * (far - near)
-        place = (eye + depth * ray - origin[:, None]) / spacing
+        place = (eye + depth[None] * ray - origin[:, None]) / spacing
         value = jax.scipy.ndimage.map_coordinates(distance, list(place), order=1, mode="nearest")
         return jnp.minimum(least, value / (angle * depth)), None
 
