@@ -33,7 +33,8 @@ class Grade(NamedTuple):
     @property
     def text(self) -> str:
         """The number, and what is usual."""
-        return f"{self._shown(self.value)} {self.unit} ({self.mark}; up to {self._shown(self.good)} {self.unit} is usual)"
+        usual = f"up to {self._shown(self.good)} {self.unit} is usual"
+        return f"{self._shown(self.value)} {self.unit} ({self.mark}; {usual})"
 
     def _shown(self, value: float) -> str:
         return f"{100 * value:.3g}" if self.unit == "%" else f"{value:.3g}"

@@ -7,11 +7,6 @@ from dano.vision.capture._camera import (
 )
 from dano.vision.capture._capture import Capture as Capture, View as View
 from dano.vision.capture._capture_files import load_camera as load_camera, load_capture as load_capture
-from dano.vision.capture._decided import (
-    decided_by_colours as decided_by_colours,
-    left_out as left_out,
-    Solid as Solid,
-)
 from dano.vision.capture._hull import (
     hull_distance as hull_distance,
     object_box as object_box,
@@ -19,12 +14,6 @@ from dano.vision.capture._hull import (
     viewed_ball as viewed_ball,
 )
 from dano.vision.capture._light import Light as Light
-from dano.vision.capture._masks import (
-    background_mask as background_mask,
-    check_masks as check_masks,
-    is_plain as is_plain,
-    with_masks as with_masks,
-)
 from dano.vision.capture._node_grid import NodeGrid as NodeGrid, resampled as resampled
 from dano.vision.capture._pictures import (
     picture_files as picture_files,
@@ -39,3 +28,12 @@ from dano.vision.capture._ray_set import (
 )
 from dano.vision.capture._rays import box_interval as box_interval, Rays as Rays
 from dano.vision.capture._shown import silhouette as silhouette
+from dano.vision.capture.masks import (
+    background_mask as background_mask,
+    check_masks as check_masks,
+    decided_by_colours as decided_by_colours,
+    is_plain as is_plain,
+    left_out as left_out,
+    Solid as Solid,
+    with_masks as with_masks,
+)

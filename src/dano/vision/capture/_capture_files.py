@@ -16,8 +16,8 @@ import numpy as np
 from dano.checks import checked_count, checked_path, shown
 from dano.vision.capture._camera import PosedCamera
 from dano.vision.capture._capture import Capture, SPLITS, View
-from dano.vision.capture._masks import cut_out
 from dano.vision.capture._pictures import read_mask, read_picture, Turned
+from dano.vision.capture.masks import cut_out
 
 _HOLD_OUT = 8
 """Where a capture has no split, one in this many views is held out, as is usual since LLFF."""

@@ -10,12 +10,12 @@ from scipy import ndimage
 from dano.extras import NETWORKS
 from dano.fields import largest_part
 from dano.vision.capture._capture import Capture, View
-from dano.vision.capture._decided import left_out
 from dano.vision.capture._hull import hull_distance, object_box, silhouettes, spare_of
 from dano.vision.capture._node_grid import NodeGrid
 from dano.vision.capture._ray_set import rays_of
 from dano.vision.capture._shown import silhouette
-from dano.vision.capture._standing import standing_masks
+from dano.vision.capture.masks._decided import left_out
+from dano.vision.capture.masks._standing import standing_masks
 
 _BORDER = 0.03
 """Share of the image on each side that is taken for background."""

@@ -10,10 +10,13 @@ from scipy import ndimage
 from dano.vision.capture._capture import View
 from dano.vision.capture._node_grid import NodeGrid
 from dano.vision.capture._shown import silhouette
-from dano.vision.capture._tabletop import shown_by, Tabletop
+from dano.vision.capture.masks._tabletop import shown_by, Tabletop
 
 _BAND = 0.1
 """Half the width of the band around an outline in which colours decide, over the root of its area."""
+
+_LIKE = 0.1
+"""Difference [sRGB] from what is behind up to which a pixel may show that."""
 
 _AROUND = 1.5
 """Half the side of the table's picture, over the longest side of the object."""
@@ -49,14 +52,20 @@ def decided_by_colours(
     low, high = (solid.box.origin + solid.box.spacing * edge for edge in (nodes.min(0), nodes.max(0)))
     middle, half = 0.5 * (low + high)[:2], _AROUND * float((high - low).max())
     top = Tabletop.of(views, hidden, table, middle - half, 2 * half)
-    return [
-        view.replaced(
-            mask=mask.astype(np.float32),
-            behind=shown_by(view, top, gain),
-            doubt=(_around(mask > 0.5) | ((share > 0.5) & (mask < 0.5))).astype(np.float32),
+    found = []
+    for view, mask, share, gain in zip(views, covered, shown, top.gain, strict=True):
+        behind = shown_by(view, top, gain)
+        doubt = _around(mask > 0.5) | ((share > 0.5) & (mask < 0.5)) | _like(view, behind)
+        found.append(
+            view.replaced(mask=mask.astype(np.float32), behind=behind, doubt=doubt.astype(np.float32))
         )
-        for view, mask, share, gain in zip(views, covered, shown, top.gain, strict=True)
-    ]
+    return found
+
+
+def _like(view: View, behind: np.ndarray) -> Bool[np.ndarray, "height width"]:
+    """Where a photograph shows what is behind the object, as through a hole, or looks like that."""
+    apart = np.abs(np.nan_to_num(behind, nan=9.0) - view.image).max(axis=-1)
+    return ndimage.binary_opening(ndimage.gaussian_filter(apart, 0.7) < _LIKE)
 
 
 def _around(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from dano.vision.capture._capture import View
-from dano.vision.capture._cut import cut_in_two
 from dano.vision.capture._hull import LOST, spare_of, viewed_ball
 from dano.vision.capture._node_grid import NodeGrid
-from dano.vision.capture._tabletop import (
+from dano.vision.capture.masks._cut import cut_in_two
+from dano.vision.capture.masks._tabletop import (
     Behind,
     evidence_of,
     GAUSSIAN,
