@@ -12,11 +12,11 @@ from vision import sliding_box, tabletop
 from dano.cli.film import Film, STAGES
 from dano.cli.film._after import stages_after
 from dano.cli.film._before import stages_before
-from dano.cli.film._grades import Grade, Verdict
+from dano.cli.film._grades import Grade, grades_of, Verdict, verdict_of, write_verdict
 from dano.cli.film._place import place_of
 from dano.cli.film._slide import find_slide
 from dano.cli.film._stages import run_stages, Stage
-from dano.identification import Motion
+from dano.identification import Motion, save_motion
 
 
 class Kitchen:
@@ -189,6 +189,45 @@ def test_a_number_is_good_up_to_what_is_usual_and_one_that_is_not_known_is_poor(
     marks = [Grade("masks", "holes", value, 0.02, 0.12).mark for value in (0.02, 0.07, 0.13, np.nan)]
     assert marks == ["good", "fair", "poor", "poor"]
     assert Grade("masks", "holes", 0.074, 0.02, 0.12).text == "7.4 % (fair; up to 2 % is usual)"
+
+
+def test_the_last_page_shows_all_numbers_and_which_not_to_believe(inputs: Film):
+    place = place_of(inputs)
+    place.folder.mkdir()
+    left = {
+        "check": {"walk": {"looked_at": 10, "marked": 8}},
+        "cameras": {"reprojection_error": 0.7},
+        "fit": {"residual": 0.074},
+        "object": {"unexplained": 0.15},
+        "motion": {"quality": 0.97},
+        "friction": {
+            "values": {"my_soap,table.sliding_friction": 0.3},
+            "standard_errors": {"my_soap,table.sliding_friction": 0.004},
+            "errors": {"rms": 4.2},
+        },
+    }
+    for name, content in left.items():
+        (place.folder / f"{name}.json").write_text(json.dumps(content), encoding="utf-8")
+    steps = 8
+    slid = Motion.create(
+        np.arange(steps) / 30,
+        "my_soap",
+        position=np.zeros((steps, 3)),
+        orientation=np.tile([1.0, 0, 0, 0], (steps, 1)),
+        covariance=np.tile(1e-6 * np.eye(6), (steps, 1, 1)),
+        alike=(0.01, 0.006, 0.02),
+        point="origin",
+    )
+    save_motion(place.folder / "slide.npz", slid)
+    grades = grades_of(place, STAGES[:-1])
+    assert [grade.mark for grade in grades] == ["good", "good", "fair", "poor", "good", "poor"]
+    assert grades[0].value == pytest.approx(0.2) and grades[4].value == pytest.approx(0.03)
+    verdict = verdict_of(place)
+    assert verdict.error == pytest.approx(np.linalg.norm([4.2 * 0.004, 0.3 * 0.02, 0.3 * 0.12]))
+    write_verdict(place.folder / "summary.html", place, grades, verdict)
+    page = (place.folder / "summary.html").read_text(encoding="utf-8")
+    assert "Friction 0.3 ± 0.04 (the fit alone says ± 0.004)" in page
+    assert page.count("should not be believed") == 2 and "7.4 % (fair" in page
 
 
 @pytest.mark.slow
