@@ -40,6 +40,7 @@ from dano.vision.radiance import (
     AbstractModel as AbstractModel,
     Appearance as Appearance,
     DensityModel as DensityModel,
+    Doubt as Doubt,
     HashModel as HashModel,
     LearnedField as LearnedField,
     Network as Network,
