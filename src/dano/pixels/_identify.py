@@ -12,7 +12,16 @@ from dano.identification import Identification, identify, IdentifyOptions, Motio
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
 from dano.progress import Progress
 from dano.scene import Scene
-from dano.vision import adjust_poses, Film, LearnedField, Light, PosedCamera, Tracked, TrackOptions
+from dano.vision import (
+    adjust_poses,
+    Film,
+    LearnedField,
+    Light,
+    PosedCamera,
+    steady_film,
+    Tracked,
+    TrackOptions,
+)
 
 _SETTLED = 0.25
 """Move of a parameter, in its standard errors, that ends the search: each pass moves it by about half of what
@@ -100,6 +109,7 @@ def identify_in_film(
     body = motion.names[0]
     tracking = checked_optional("tracking", tracking, TrackOptions) or TrackOptions()
     tracking = _with_table(scene, motion, tracking)
+    film = steady_film(film, camera, background, tracking.readout)
     options = checked_optional("options", settings.pop("options", None), IdentifyOptions) or IdentifyOptions()
     # The trend of a rough loss is worth its simulations only where the search ends.
     on_the_way = dataclasses.replace(options, smooth=False)
