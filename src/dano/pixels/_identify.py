@@ -41,7 +41,7 @@ class FilmFit(NamedTuple):
     """Parameters from a film.
 
     Attributes:
-        fit: Values with error bars, and the motion that they give.
+        fit: Values with error bars, and the motion that they give; that of the poses if pixels add nothing.
         poses: The same from the poses alone, which the search began with.
         tracked: What the film shows at the motion found: quality and status of frames, light, silhouettes.
         history: Values of the parameters after each pass, the first of them from the poses alone.
@@ -80,8 +80,11 @@ def identify_in_film(
     simulated poses, and residuals of silhouettes and colours, weighted robustly, are linearised there: a step
     of Gauss–Newton on pixels, through renderer and simulation, in parameters and initial state. The light is
     fitted in between. Poses of the motion, which all frames together have made, count as much as what the
-    pixels of a frame say near the simulated one, and neither makes the other surer. Memory is that of one
-    frame beside the rollout.
+    pixels of a frame say near the simulated one, and neither makes the other surer.
+
+    Where the first step moves no value by more than a quarter of its standard error, pixels say what the
+    poses said. The fit of the poses is the result then, and the search ends. Standard errors are never
+    smaller than those from the poses. Memory is that of one frame beside the rollout.
 
     Args:
         scene: The scene, with values for whatever is not a parameter.
@@ -136,12 +139,30 @@ def identify_in_film(
             scene, pulled, parameters, after=fit, progress=progress, options=on_the_way, **settings
         )
         history.append(fit.values)
-        if settled := _moved(last, fit) < _SETTLED and k + 1 >= _LIGHT_PASSES:
+        moved = _moved(last, fit)
+        if k == 0 and moved < _SETTLED:
+            # The poses were made of these pixels, which have nothing to add.
+            return FilmFit(before, before, found, tuple(history), True)
+        if settled := moved < _SETTLED and k + 1 >= _LIGHT_PASSES:
             break
     assert found is not None and pulled is not None
     if options.smooth:
         fit = identify(scene, pulled, parameters, after=fit, progress=progress, options=options, **settings)
-    return FilmFit(fit, before, found, tuple(history), settled)
+    return FilmFit(_no_smaller(fit, before), before, found, tuple(history), settled)
+
+
+def _no_smaller(fit: Identification, before: Identification) -> Identification:
+    """A fit with errors that are nowhere smaller than those of another one of the same pixels."""
+    here, there = np.diagonal(fit.covariance), np.diagonal(before.covariance)
+    some = np.isfinite(here) & np.isfinite(there) & (here > 0)
+    wider = np.ones(len(here))
+    wider[some] = np.sqrt(np.maximum(there[some] / here[some], 1.0))
+    errors = {
+        name: np.maximum(np.asarray(error), np.asarray(before.standard_errors[name]))
+        for name, error in fit.standard_errors.items()
+    }
+    covariance = fit.covariance * np.outer(wider, wider)
+    return dataclasses.replace(fit, standard_errors=errors, covariance=covariance)
 
 
 def _with_table(scene: Scene, motion: Motion, options: TrackOptions) -> TrackOptions:
