@@ -27,6 +27,9 @@ _SETTLED = 0.25
 """Move of a parameter, in its standard errors, that ends the search: each pass moves it by about half of what
 the one before did, and as much is left."""
 
+_NEARBY = 2.0
+"""Standard deviations of what pixels alone say up to which poses agree with them."""
+
 _LIGHT_PASSES = 2
 """Passes in which the light is fitted: after that poses are right, and it would only follow the noise."""
 
@@ -82,9 +85,10 @@ def identify_in_film(
     fitted in between. Poses of the motion, which all frames together have made, count as much as what the
     pixels of a frame say near the simulated one, and neither makes the other surer.
 
-    Where the first step moves no value by more than a quarter of its standard error, pixels say what the
-    poses said. The fit of the poses is the result then, and the search ends. Standard errors are never
-    smaller than those from the poses. Memory is that of one frame beside the rollout.
+    Where most poses lie within two standard deviations of where the pixels want them, and the first step
+    moves no value by more than a quarter of its standard error, pixels say what the poses said. The fit of
+    the poses is the result then, and the search ends. Standard errors are never smaller than those from the
+    poses. Memory is that of one frame beside the rollout.
 
     Args:
         scene: The scene, with values for whatever is not a parameter.
@@ -133,14 +137,15 @@ def identify_in_film(
             progress=progress,
         )
         lamps = found.lamps if k + 1 >= _LIGHT_PASSES else None
-        pulled = _fused(Motion.from_tracked(found, body), motion)
+        alone = Motion.from_tracked(found, body)
+        pulled = _fused(alone, motion)
         last = fit
         fit = identify(
             scene, pulled, parameters, after=fit, progress=progress, options=on_the_way, **settings
         )
         history.append(fit.values)
         moved = _moved(last, fit)
-        if k == 0 and moved < _SETTLED:
+        if k == 0 and moved < _SETTLED and _agree(alone, motion):
             # The poses were made of these pixels, which have nothing to add.
             return FilmFit(before, before, found, tuple(history), True)
         if settled := moved < _SETTLED and k + 1 >= _LIGHT_PASSES:
@@ -149,6 +154,17 @@ def identify_in_film(
     if options.smooth:
         fit = identify(scene, pulled, parameters, after=fit, progress=progress, options=options, **settings)
     return FilmFit(_no_smaller(fit, before), before, found, tuple(history), settled)
+
+
+def _agree(pulled: Motion, motion: Motion) -> bool:
+    """Whether poses of a motion lie where the pixels want them, by what pixels alone know."""
+    assert pulled.covariance is not None
+    known, seen = _information(pulled.covariance[:, 0])
+    seen &= np.isfinite(motion.position[:, 0]).all(axis=1)
+    turn = quat_log(quat_multiply(quat_conjugate(pulled.orientation[seen, 0]), motion.orientation[seen, 0]))
+    apart = np.concatenate([motion.position[seen, 0] - pulled.position[seen, 0], turn], axis=1)
+    square = np.einsum("ni,nij,nj->n", apart, known[seen], apart) / 6
+    return bool(seen.any()) and float(np.median(square)) < _NEARBY**2
 
 
 def _no_smaller(fit: Identification, before: Identification) -> Identification:
