@@ -28,8 +28,8 @@ _STEPS = 4
 """Steps of Gauss and Newton in a frame that is not where the motion has it, most."""
 
 _COARSE_STEPS, _FINE_STEPS = 10, 8
-"""Steps of Gauss and Newton at half of the resolution and at all of it, most, until a frame has settled. Along
-the line of sight, where a blow led tracking beside the object, four steps went half of the distance."""
+"""Steps of Gauss and Newton at half of the resolution and at all of it, most, until a frame has settled.
+Where a blow led tracking beside the object, along the line of sight, four steps went half of the distance."""
 
 _SMALLEST = 40.0
 """Size of an object [pixels] from which half of the resolution shows it."""
