@@ -138,8 +138,8 @@ def pull_patch_of_impact(
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             (
-                by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, by_bounce, by_rests,
-                _b,
+                by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, by_bounce,
+                by_rests, _b,
             ) = wp.grad(impact_patch_work)(
                 pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, bounce,
                 left_out(found, pair.factor), patch_bar,
