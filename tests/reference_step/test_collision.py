@@ -99,7 +99,8 @@ def test_a_fast_body_does_not_pass_a_thin_wall_unseen():
     """A box at 300 m/s meets a plate of .2 mm that it crosses within 1/3000 of a step."""
     plate = dano.Body("plate", dano.Box((0.2, 0.2, 1e-4)), fixed=True)
     box = dano.Body("a", dano.Box((0.05, 0.04, 0.03)), mass=1.0)
-    scene = dano.Scene.create([box, plate], [dano.Contact("a", "plate")], timestep=scenes.H)
+    deep = dano.ContactParams(impact_depth=1e-3)
+    scene = dano.Scene.create([box, plate], [dano.Contact("a", "plate", deep)], timestep=scenes.H)
     state = scene.initial_state(
         a=dict(position=(0, 0, 0.2), velocity=(0, 0, -300.0), orientation=scenes.TILTED)
     )

@@ -36,7 +36,10 @@ def random_points(law, impact):
         depth=rng.normal(size=N) * 10 ** rng.uniform(-6, -1, N),
         rate=rng.normal(size=N),
         meets=rng.normal(size=N),
-        gains=0.1 * rng.normal(size=N),
+        gains=0.1 * rng.normal(size=3),
+        after=-0.1 * law.h,
+        turns=(np.diag([-40.0, -30.0, -50.0]), np.array([2.0, 3.0, -4.0])),
+        support=np.zeros(6),
         area=10 ** rng.uniform(-6, -3, N),
         drift=drift,
         impact=impact * np.where(x < 1, np.maximum(x, 0) ** 2, 2 * x - 1),
@@ -47,6 +50,8 @@ def random_points(law, impact):
         beta=0.7 if impact > 0 else 0.0,
         delays=0.4 if impact > 0 else 0.0,
         way=0.36 if impact > 0 else 0.6,
+        part=1.0,
+        left_out=0.4,
     )
 
 

@@ -30,7 +30,7 @@ IMPACT_DEPTH = 0.005
 # that of others. A face that closes over a cushion lands row by row: many small impacts lose less. What an
 # impact leaves deep is pushed out after it. But edges that rest are less deep than one that lands, so that it
 # is the first that has an impact.
-_SHARP_SINKING, _SHARP_DEPTH = 1e-4, 2e-4
+_SHARP_SINKING, _SHARP_DEPTH = 1e-5, 2e-4
 # Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
 _SLOW = 0.2
 

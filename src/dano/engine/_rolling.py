@@ -65,7 +65,9 @@ def _prepared(engine: Any, scene: Scene) -> Any:
     found = _KEPT.get(key)
     if found is not None and found[0]() is scene:
         return found[1]
-    prepared = engine.prepare(scene)
+    # Also where a program around it is traced: what is kept belongs to no trace.
+    with jax.ensure_compile_time_eval():
+        prepared = engine.prepare(scene)
     while len(_KEPT) >= _MOST:
         _KEPT.pop(next(iter(_KEPT), None), None)
     _KEPT[key] = weakref.ref(scene, lambda _: _KEPT.pop(key, None)), prepared
