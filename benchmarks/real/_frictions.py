@@ -21,6 +21,9 @@ MEASURING = {"radius": 0.004745, "scale": -0.00668, "x": 0.000862, "y": 0.000734
 BLOCK = {"friction": 0.252, "feet": 0.0684}
 """Of the pushes: what `pushes` fits to every second recording."""
 
+OWN_SCALE = "Scale of the pusher's coordinates, from where it touches the block"
+_SECOND = 250  # frames
+
 PARTS = 12
 """Of the impacts."""
 
@@ -41,6 +44,11 @@ def rows(source: Source | None, *, quick: bool = False) -> list[Row]:
         found.append(
             Row("Friction of pusher and block", push.name, float(fit.values["friction"]), "", note=note)
         )
+    for push in pushes:
+        # The first second, before the block has turned.
+        deep = 1e3 * float(np.median(push.overlap(MEASURING)[:_SECOND]))
+        note = f"with the scale of all the pusher is {deep:.2f} mm in the block in the first second"
+        found.append(Row(OWN_SCALE, push.name, 100 * push.measured(MEASURING)["scale"], "%", note=note))
     found += _shares("Pushes: 95 % intervals that hold the friction of the other recordings", fits)
     impacts = Impacts.load(source.folder / "impacts.npz", slice(None))
     parts = 3 if quick else PARTS
@@ -120,16 +128,17 @@ def identify(
 ) -> dano.Identification:
     """Friction of the pusher from one recording, in pieces of half a second.
 
-    Each piece is a motion that begins where the block was and as fast: a blow spoils only its own. The
-    friction of the table does not show: the block stops as soon as it is not pushed.
+    The scale of the pusher's coordinates is the recording's own. Each piece is a motion that begins where
+    the block was and as fast: a blow spoils only its own. The friction of the table does not show: the block
+    stops as soon as it is not pushed.
     """
-    made = scene(MEASURING["radius"], **BLOCK)
+    made, measuring = scene(MEASURING["radius"], **BLOCK), push.measured(MEASURING)
     count = min(len(push) // PIECE, MOST_PIECES)
     pieces = [
         Push(push.name, push.block[k * PIECE : (k + 1) * PIECE], push.pusher[k * PIECE : (k + 1) * PIECE])
         for k in range(count)
     ]
-    paths = [piece.path(MEASURING) for piece in pieces]
+    paths = [piece.path(measuring) for piece in pieces]
     friction = dano.Parameter("friction", lambda s: s.contact("pusher", "block").sliding_friction, 0.02, 1.0)
     options = dano.IdentifyOptions(huber=1.5, independent=independent, starts=1, smooth=False)
     with warnings.catch_warnings():

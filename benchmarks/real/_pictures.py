@@ -23,10 +23,10 @@ def scatter(
             axis.plot(seen, values, ".", ms=2, color=colour, label=label, alpha=0.6)
         axis.set_title(title, fontsize=8)
         axis.set(xlabel="recorded", xlim=edges)
-        margin = 0.6 * (edges[1] - edges[0])
+        margin = 0.3 * (edges[1] - edges[0])
         axis.set_ylim(edges[0] - margin, edges[1] + margin)
     axes[0].set_ylabel("predicted")
-    axes[0].legend(markerscale=4, fontsize=7, loc="upper left", frameon=False)
+    _legend(figure, axes[0], markerscale=4)
     return saved(figure, path)
 
 
@@ -44,6 +44,14 @@ def figure_of(n: int, width: float = 2.8, height: float = 2.6):
     return figure, axes
 
 
+def _legend(figure, axis, **options) -> None:
+    """Names of the curves of a panel, below all: in a panel they would lie on what is drawn."""
+    handles, names = axis.get_legend_handles_labels()
+    figure.legend(
+        handles, names, loc="outside lower center", ncols=len(names), fontsize=7, frameon=False, **options
+    )
+
+
 def saved(figure, path: Path) -> Path:
     """Write it as a PNG with few colours."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,7 +63,7 @@ def squares(
     path: Path, seen: np.ndarray, ours: np.ndarray, other: np.ndarray, half: float, frames: Sequence[int]
 ) -> Path:
     """Recorded paths of four drops, and squares after a while: recorded, dano's and another's."""
-    figure, axes = figure_of(4, width=2.4, height=1.9)
+    figure, axes = figure_of(4, width=2.4, height=2.1)
     corners = half * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
     for axis, i in zip(axes, np.linspace(0, len(seen) - 1, 6, dtype=int)[1:5], strict=True):
         axis.plot(*(1e3 * seen[i, :, :2]).T, color=SEEN, lw=0.8)
@@ -70,7 +78,7 @@ def squares(
         axis.axhline(0, color=SEEN, lw=0.5)
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_xlabel("mm")
-    axes[0].legend(fontsize=6, loc="upper right", frameon=False)
+    _legend(figure, axes[0])
     return saved(figure, path)
 
 
@@ -84,7 +92,7 @@ def paths(
 ) -> Path:
     """Paths of pushed blocks seen from above, with the block where it ended: recorded, dano's, another's."""
     n = min(len(names), 4)
-    figure, axes = figure_of(n, width=2.4, height=1.8)
+    figure, axes = figure_of(n, width=2.4, height=2.1)
     corners = half * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
     for axis, name, *three in zip(axes, names, seen, ours, other, strict=False):
         for poses, colour, label in zip(
@@ -97,13 +105,13 @@ def paths(
         axis.set_title(name, fontsize=6)
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_xlabel("mm")
-    axes[0].legend(fontsize=6, loc="best", frameon=False)
+    _legend(figure, axes[0])
     return saved(figure, path)
 
 
 def tools(path: Path, panels: Sequence[tuple[str, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]) -> Path:
     """Outlines of tools, with their centres of mass: true, of their parts, of one material."""
-    figure, axes = figure_of(len(panels), width=2.2, height=2.2)
+    figure, axes = figure_of(len(panels), width=2.2, height=2.4)
     for axis, (name, points, true, parts, one) in zip(axes, panels, strict=True):
         # The two directions in which it is longest.
         first, second = np.argsort(-np.ptp(points, axis=0))[:2]
@@ -118,5 +126,5 @@ def tools(path: Path, panels: Sequence[tuple[str, np.ndarray, np.ndarray, np.nda
         axis.set_title(name, fontsize=7)
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_xlabel("mm")
-    axes[0].legend(fontsize=6, frameon=False)
+    _legend(figure, axes[0])
     return saved(figure, path)

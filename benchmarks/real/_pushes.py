@@ -18,7 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import least_squares, minimize
 
 import dano
 from benchmarks._measure import Row, skipped
@@ -35,6 +35,13 @@ MOTOR = 1e6  # N/m: a push of 5 N moves it back by 5 µm
 
 MEASURING = {"radius": 0.0048, "scale": -0.0055, "x": 0.0, "y": 0.0}
 SIZES = {"radius": 3e-4, "scale": 1e-3, "x": 5e-4, "y": 5e-4}
+
+OWN = ("scale", "x")
+"""What of the measurement may be a recording's own."""
+# Windows [frames] in which the pusher slips faster than this [m/s]; how even they must be [m].
+_WINDOW, _SLIPS, _SMOOTH = 25, 4e-3, 5e-4
+# Pusher and block touch if they seem to be nearer than this; and how well the tracker knows it [m].
+_TOUCHES, _TRACKED = 2e-3, 2e-4
 
 # Frames that tell how fast the block is: 40 ms, in which it moves by 2 mm.
 _FIRST = 10
@@ -84,6 +91,55 @@ class Push:
         """The pusher's path in the camera's coordinates [m]."""
         begin = np.array([0.15, 0.0])
         return (self.pusher - begin) * (1 + measuring["scale"]) + begin + [measuring["x"], measuring["y"]]
+
+    def overlap(self, measuring: Mapping[str, float]) -> np.ndarray:
+        """How deep the pusher is in the block [m] in each frame; negative: apart."""
+        rel = self.path(measuring) - self.block[:, :2]
+        cosine, sine = np.cos(self.block[:, 2]), np.sin(self.block[:, 2])
+        inside = np.stack(
+            [cosine * rel[:, 0] + sine * rel[:, 1], -sine * rel[:, 0] + cosine * rel[:, 1]], axis=-1
+        )
+        return measuring["radius"] - np.linalg.norm(inside - np.clip(inside, -HALF, HALF), axis=1)
+
+    def measured(self, measuring: Mapping[str, float]) -> dict[str, float]:
+        """Scale and zero along x with which the pusher, where it touches the block, is not in it.
+
+        It takes no law, and no friction. The pushes go along x: y hardly shows.
+        """
+        touching = self.overlap(measuring) > -_TOUCHES
+        sizes = [SIZES[name] for name in OWN]
+
+        def values(x: np.ndarray) -> dict[str, float]:
+            return {**measuring, **{name: measuring[name] + d for name, d in zip(OWN, x, strict=True)}}
+
+        def residuals(x: np.ndarray) -> np.ndarray:
+            return self.overlap(values(x))[touching] / _TRACKED
+
+        return values(least_squares(residuals, np.zeros(len(OWN)), x_scale=sizes, loss="soft_l1").x)
+
+    def slips(self, measuring: Mapping[str, float]) -> np.ndarray:
+        """Where the pusher slips along the block: turn of the block [rad], and friction, shape (n, 2).
+
+        Without a fit: slow support friction that is the same in all directions moves the block's middle along
+        the force, and while the pusher slips the force is on the edge of its cone. Of windows of a tenth of a
+        second, without blows and with the pusher on the face behind.
+        """
+        path, found = self.path(measuring), []
+        times = FRAME * np.arange(_WINDOW)
+        for k in range(0, len(self) - _WINDOW, _WINDOW):
+            block, pusher = self.block[k : k + _WINDOW], path[k : k + _WINDOW]
+            (at, rate), (place, moved) = (
+                np.polynomial.polynomial.polyfit(times - times.mean(), each, 1) for each in (block, pusher)
+            )
+            cosine, sine = np.cos(at[2]), np.sin(at[2])
+            turn = np.array([[cosine, sine], [-sine, cosine]])
+            contact, going, middle = turn @ (place - at[:2]), turn @ moved, turn @ rate[:2]
+            slip = going[1] - (middle[1] - rate[2] * HALF)
+            touches = abs(contact[0] + HALF + measuring["radius"]) < _SMOOTH and abs(contact[1]) < HALF
+            smooth = np.abs(block - at - np.outer(times - times.mean(), rate))[:, :2].max() < _SMOOTH
+            if touches and smooth and abs(slip) > _SLIPS and middle[0] > 2 * _SLIPS:
+                found.append((at[2], middle[1] * np.sign(slip) / middle[0]))
+        return np.array(found).reshape(-1, 2)
 
     def stretches(self) -> "list[Push]":
         """Its stretches of two seconds."""

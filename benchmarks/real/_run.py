@@ -5,14 +5,26 @@ import functools
 from pathlib import Path
 
 from benchmarks._measure import load_average, parse_arguments, parts_option, report, rows_of_parts
-from benchmarks.real import _frictions, _impacts, _pushes, _squares, _tools
+from benchmarks.real import (
+    _first_impacts,
+    _frictions,
+    _impacts,
+    _pushes,
+    _round_corners,
+    _slips,
+    _squares,
+    _tools,
+)
 from benchmarks.real._data import data_folder, Source
 
 PARTS = {
     "impacts": _impacts,
     "squares": _squares,
+    "first-impacts": _first_impacts,
+    "round-corners": _round_corners,
     "pushes": _pushes,
     "frictions": _frictions,
+    "slips": _slips,
     "tools": _tools,
 }
 

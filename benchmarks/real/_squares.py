@@ -134,7 +134,7 @@ def tuned(
         count += 1
         if values(x).get("restitution", 0.0) > 0.95:
             return 2.0
-        return _misfit(errors(simulate(fitted.starts, values(x)), fitted))
+        return float(misfits(errors(simulate(fitted.starts, values(x)), fitted)).mean())
 
     best = np.zeros(len(names))
     for _ in range(2):
@@ -151,46 +151,71 @@ def errors(predicted: np.ndarray, seen: Drops) -> np.ndarray:
     return np.nan_to_num(pairs, nan=10.0)
 
 
-def _misfit(off: np.ndarray) -> float:
-    return float(np.mean(off / (off + np.array(_HALF_OFF))))
+def misfits(off: np.ndarray) -> np.ndarray:
+    """How wrong each drop is, from 0 to 1, shape (n,)."""
+    return np.mean(off / (off + np.array(_HALF_OFF)), axis=(1, 2))
 
 
 # --- dano ---------------------------------------------------------------------------------------------------
 
 
 def scene(
-    timestep: float, friction: float, restitution: float, hysteresis: float, gyration: float
+    timestep: float,
+    friction: float,
+    restitution: float,
+    hysteresis: float,
+    gyration: float,
+    radius: float = 0.0,
+    *,
+    stiffness: float | None = None,
+    gravity: float = GRAVITY,
 ) -> dano.Scene:
-    """The square between its panes: a planar joint about −y, whose angle turns x into z."""
+    """The square between its panes: a planar joint about −y, whose angle turns x into z.
+
+    Its corners are round with a radius [m]. With a stiffness [Pa/m] impacts take the time that a spring of it
+    needs; else they end within a step.
+    """
     inertia = MASS * gyration**2 * np.eye(3)
-    square = dano.Body("square", dano.Box((HALF,) * 3), mass=MASS, inertia=inertia)
+    square = dano.Body("square", dano.Box((HALF,) * 3, radius), mass=MASS, inertia=inertia)
     floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
     panes = dano.Joint(None, "square", "planar", axis=(0, -1, 0))
     params = dano.ContactParams(
-        sliding_friction=friction, restitution=restitution, hysteresis=min(hysteresis, 1.0)
+        sliding_friction=friction,
+        restitution=restitution,
+        hysteresis=min(hysteresis, 1.0),
+        stiffness=stiffness,
     )
+    in_time = dano.DistributedLaw(compliant=True, implicitness=0.5)
+    law = dano.DistributedLaw() if stiffness is None else in_time
     return dano.Scene.create(
         [square, floor],
-        [dano.Contact("square", "floor", params)],
+        [dano.Contact("square", "floor", params, law=law)],
         joints=[panes],
         timestep=timestep,
-        gravity=(0, 0, -GRAVITY),
+        gravity=(0, 0, -gravity),
     )
+
+
+def begun(made: dano.Scene, q: np.ndarray, v: np.ndarray) -> dano.State:
+    """States with the joint at q (x, z, θ) and as fast as v, both of shape (n, 3)."""
+    one = made.initial_state(square={"q": (0.0, 1.0, 0.0)})
+    many = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(q), *x.shape)), one)
+    states = eqx.tree_at(lambda s: (s.q, s.v), many, (jnp.asarray(q), jnp.asarray(v)))
+    return jax.vmap(made.filled)(states)
 
 
 def simulated(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
     """Poses at `MOMENTS` by dano, shape (n, moments, 3)."""
     timestep = FRAME / STEPS_A_FRAME
     made = scene(timestep, **values)
-    one = made.initial_state(square={"q": (0.0, 1.0, 0.0)})
     # Velocities of a state belong to half a step before it.
     early = starts[:, 3:] + np.array([0.0, GRAVITY * timestep / 2, 0.0])
-    q, v = starts[:, :3], early
-    many = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(q), *x.shape)), one)
-    states = eqx.tree_at(lambda s: (s.q, s.v), many, (jnp.asarray(q), jnp.asarray(v)))
     last = max(MOMENTS.values())
     runs = dano.rollouts(
-        made, jax.vmap(made.filled)(states), last * STEPS_A_FRAME, keep=STEPS_A_FRAME * min(MOMENTS.values())
+        made,
+        begun(made, starts[:, :3], early),
+        last * STEPS_A_FRAME,
+        keep=STEPS_A_FRAME * min(MOMENTS.values()),
     )
     kept = np.asarray(runs.steps).tolist()
     wanted = [kept.index(frame * STEPS_A_FRAME) for frame in MOMENTS.values()]
@@ -214,7 +239,7 @@ def of_mujoco(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
         '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint type="hinge" axis="0'
         ' -1 0"/>'
         f'<inertial mass="{MASS}" pos="0 0 0" diaginertia="{inertia} {inertia} {inertia}"/>'
-        f'<geom type="box" size="{HALF} {HALF} {HALF}"/>'
+        f"{_square_of_mujoco(values.get('radius', 0.0))}"
         "</body></worldbody></mujoco>"
     )
     data = mujoco.MjData(model)
@@ -224,6 +249,20 @@ def of_mujoco(starts: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
     states, _ = rollout.rollout(model, data, begun, nstep=max(MOMENTS.values()) * MUJOCO_STEPS)
     wanted = [frame * MUJOCO_STEPS - 1 for frame in MOMENTS.values()]
     return states[:, wanted, 1:4]
+
+
+def _square_of_mujoco(radius: float) -> str:
+    """A box; with round corners two boxes and a rod in each corner."""
+    less = HALF - radius
+    boxes = [(HALF, HALF, less), (less, HALF, HALF)] if radius else [(HALF, HALF, HALF)]
+    geoms = [f'<geom type="box" size="{x} {y} {z}"/>' for x, y, z in boxes]
+    if radius:
+        geoms += [
+            f'<geom type="capsule" size="{radius}" fromto="{x} {-HALF} {z} {x} {HALF} {z}"/>'
+            for x in (-less, less)
+            for z in (-less, less)
+        ]
+    return "".join(geoms)
 
 
 MUJOCO_STEPS = 4
@@ -293,7 +332,7 @@ def _beside(off: Mapping[str, np.ndarray]) -> list[Row]:
 
 def _start(poses: np.ndarray, row: np.ndarray) -> np.ndarray:
     """x, z, θ and rates at the first frame: of a fall through the frames before anything touches."""
-    free = int(np.argmax(_lowest(poses) < _CLEAR))
+    free = int(np.argmax(lowest(poses) < _CLEAR))
     if free < _ENOUGH:
         return np.concatenate([poses[0], row[0, 3:]])
     times = FRAME * np.arange(free)
@@ -302,7 +341,7 @@ def _start(poses: np.ndarray, row: np.ndarray) -> np.ndarray:
     return np.array([fit[0] for fit in fits] + [fit[1] for fit in fits])
 
 
-def _lowest(poses: np.ndarray) -> np.ndarray:
+def lowest(poses: np.ndarray) -> np.ndarray:
     """Heights of the lowest corners [m]."""
     turned = np.abs(np.sin(poses[..., 2])) + np.abs(np.cos(poses[..., 2]))
     return poses[..., 1] - HALF * turned

@@ -97,6 +97,31 @@ def test_a_load_that_slips_is_refused(arm, noisy):
         dano.identify_load_on_arm(dano.JointLog.create(**{**noisy, "torque": torque}), arm, "hand")
 
 
+def test_a_bias_that_drifts_is_said_and_estimated(arm, noisy):
+    change = np.array([0.5, -1.0, 0.6, 0.0, 0.2])
+    share = (noisy["times"] / noisy["times"][-1])[:, None]
+    still = dano.identify_load_on_arm(dano.JointLog.create(**noisy), arm, "hand")
+    assert still.messages == () and still.joint_drift is not None and not still.joint_drift.any()
+    log = dano.JointLog.create(**{**noisy, "torque": noisy["torque"] + change * share})
+    found = dano.identify_load_on_arm(log, arm, "hand")
+    assert any("the bias of the torques drifts, of joint 1 by -" in text for text in found.messages)
+    assert found.joint_drift is not None and found.joint_bias is not None
+    np.testing.assert_allclose(found.joint_drift, change, atol=0.05)
+    # The bias is that in the middle of the log.
+    np.testing.assert_allclose(found.joint_bias, BIAS + change / 2, atol=0.03)
+    assert abs(found.mass / MASS - 1) < 0.02 and np.abs(found.centre - CENTRE).max() < 4e-3
+
+
+def test_a_drive_that_warms_up_does_not_change_the_load(arm, noisy):
+    change = np.array([0.5, -1.0, 0.6, 0.0, 0.2])
+    warmth = 1 - np.exp(-3 * noisy["times"] / noisy["times"][-1])
+    log = dano.JointLog.create(**{**noisy, "torque": noisy["torque"] + change * warmth[:, None]})
+    found = dano.identify_load_on_arm(log, arm, "hand")
+    assert abs(found.mass - MASS) < 4 * found.standard_errors["mass"] < 0.005 * MASS
+    assert found.joint_drift is not None
+    np.testing.assert_allclose(found.joint_drift, change * warmth[-1], atol=0.05)
+
+
 def test_logs_that_do_not_fit_are_refused(arm, noisy):
     log = dano.JointLog.create(**noisy)
     with pytest.raises(ValueError, match="torque must be what drives the joints, with their signs"):

@@ -50,15 +50,15 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 def _draw(path: Path, fit: dano.Identification) -> None:
-    """Way of the soap over time: positions of the film, and the simulation with the friction found."""
+    """Distance of the soap over time: positions of the film, and the simulation with the friction found."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.0, 2.6), layout="constrained")
     axis = figure.subplots()
     for motion, style, label in ((fit.motions[0], ".", "filmed"), (fit.fitted[0], "-", "dano")):
-        way = np.linalg.norm(motion.position[:, 0] - fit.motions[0].position[0, 0], axis=1)
-        axis.plot(1e3 * motion.times, 1e3 * way, style, label=label)
-    axis.set(xlabel="time [ms]", ylabel="way [mm]")
+        gone = np.linalg.norm(motion.position[:, 0] - fit.motions[0].position[0, 0], axis=1)
+        axis.plot(1e3 * motion.times, 1e3 * gone, style, label=label)
+    axis.set(xlabel="time [ms]", ylabel="distance [mm]")
     axis.legend(frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

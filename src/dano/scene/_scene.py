@@ -7,7 +7,7 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from dano.checks import checked_items, checked_kind, checked_optional, shown
 from dano.contact import checked_parameter, ContactParams, Distance, distance
@@ -30,6 +30,7 @@ from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, st
 from dano.scene._contacts import Contact, prepared
 from dano.scene._doubts import Doubt, doubts_of_scene, doubts_of_state, say_doubts
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
+from dano.scene._impact_duration import impact_duration
 from dano.scene._joints import Joint, Layout, layout_of
 from dano.scene._loops import check_loops, Loop, Loops, loops_of
 from dano.scene._making import (
@@ -37,6 +38,7 @@ from dano.scene._making import (
     check_materials,
     check_names,
     room_for,
+    sampled_alike,
     structure,
     twins_of,
     warn_of_limits,
@@ -63,6 +65,8 @@ class Scene(eqx.Module):
         others: Pairs of bodies that no contact names; None if they do not touch.
         room: Chunks of point contacts that a step has room for (static); None leaves it to the engine.
         loops: What closes chains of joints.
+        sampled: For each body the first with the same samples of its surface, which stand once in memory, as
+            shapes with the same numbers have them (static).
     """
 
     bodies: tuple[Body, ...]
@@ -74,6 +78,7 @@ class Scene(eqx.Module):
     others: Others | None = None
     room: int | None = eqx.field(static=True, default=None)
     loops: tuple[Loop, ...] = ()
+    sampled: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def create(
@@ -134,7 +139,8 @@ class Scene(eqx.Module):
         if contacts or rest is not None:
             warn_of_long_steps(bodies, timestep, gravity)
         room = room_for(bodies, timestep, gravity)
-        scene = cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops)
+        sampled = sampled_alike(bodies, twins)
+        scene = cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops, sampled)
         say_doubts(doubts_of_scene(bodies, joints, contacts, gravity, scene._meeting), stacklevel=2)
         return scene
 
@@ -209,11 +215,12 @@ class Scene(eqx.Module):
         return tuple(body.name for body in self.bodies)
 
     @property
-    def point_pairs(self) -> tuple[tuple[int, int], ...]:
+    def point_pairs(self) -> Int[np.ndarray, "k 2"]:
         """Indices of the bodies of each contact with a point law, then of the other pairs that may touch."""
         place = {name: i for i, name in enumerate(self.names)}
-        named = tuple((place[c.a], place[c.b]) for c in self.contacts if c.law.presses)
-        return named if self.others is None else (*named, *self.others.pairs)
+        named = [(place[c.a], place[c.b]) for c in self.contacts if c.law.presses]
+        rest = [] if self.others is None else self.others.pairs.array
+        return np.concatenate([np.array(named, int).reshape(-1, 2), np.reshape(rest, (-1, 2))]).astype(int)
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
@@ -226,7 +233,11 @@ class Scene(eqx.Module):
     @property
     def _meeting(self) -> set[str]:
         """Names of the bodies that may touch something."""
-        return {name for pair in self.pairs for name in pair}
+        named = {name for contact in self.contacts for name in (contact.a, contact.b)}
+        if self.others is None:
+            return named
+        names = self.names
+        return named | {names[i] for i in np.unique(self.others.pairs.array).tolist()}
 
     def index(self, name: str) -> int:
         """Index of a body.
@@ -438,7 +449,8 @@ class Scene(eqx.Module):
         if given is not None:
             placed = {name for name, numbers in given.items() if {"position", "origin", "q"} & set(numbers)}
         moved = {i for i, body in enumerate(self.bodies) if not body.fixed and body.name in placed}
-        pairs = [pair for pair in self.point_pairs if moved & set(pair)]
+        pairs = self.point_pairs
+        pairs = pairs[np.isin(pairs, list(moved)).any(axis=1)]
         return doubts_of_state(self.bodies, pairs, self.layout, state, float(self.timestep))
 
     def filled(self, state: State) -> State:
@@ -469,6 +481,24 @@ class Scene(eqx.Module):
             solids.append(geometry)
             poses.append(Pose(places.position[i] - arm, turn))
         return distance(*solids, pose_a=poses[0], pose_b=poses[1])
+
+    def impact_duration(self, a: str, b: str, speed: float) -> float:
+        """Time [s] that an impact of two bodies takes, where it is left to the spring; to some tens of %.
+
+        π √(m d/F) until it is turned round, with the mass m of both and the depth d at which the work F d/2
+        of the springs is m v²/2, for a typical orientation. Twenty steps of it or more resolve the impact.
+        It is a check before a simulation and cannot be differentiated.
+
+        Args:
+            a: One body.
+            b: The other one.
+            speed: With which they approach [m/s].
+
+        Raises:
+            ValueError: If there is no such contact, its impacts end within a step (a law without
+                `compliant=True`), no body of it moves, or the speed is not positive.
+        """
+        return impact_duration(self.bodies, self.contacts[self.contact_index(a, b)], speed)
 
     def joint_values(self, state: State) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
         """Coordinates q and velocities v of the joints that poses and velocities of the bodies have.

@@ -171,7 +171,10 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
     if not isinstance(law, DistributedLaw):
         return []
     if law.compliant:
-        period = _half_period(scene, contact, speed)
+        # At rest there is no impact.
+        if speed == 0.0:
+            return []
+        period = scene.impact_duration(contact.a, contact.b, speed)
         if period >= _STEPS_AN_IMPACT * h:
             return []
         return [
@@ -192,21 +195,6 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
             " they will bounce less; use a smaller timestep or restitution_velocity",
         )
     ]
-
-
-def _half_period(scene: Scene, contact: Contact, speed: float) -> float:
-    """Time [s] in which the springs of a contact turn an impact at a speed [m/s] round: π √(m d/F).
-
-    d is the depth where ½ m v² = ½ F(d) d, and F(d) = k Σ A d of the samples that are so deep when the body
-    lies on a floor in a typical orientation.
-    """
-    bodies = [scene.body(name) for name in (contact.a, contact.b)]
-    mass = 1 / sum(1 / float(body.mass * body.mass_scale) for body in bodies if not body.fixed)
-    body = min((body for body in bodies if body.surface is not None), key=lambda body: body.size)
-    depths = body.size * np.geomspace(1e-6, 0.5, 40)
-    forces = float(contact.params.stiffness) * np.array([body.typical_support(d) for d in depths])
-    deepest = int(np.argmax(forces * depths >= mass * speed**2))
-    return math.pi * math.sqrt(mass * depths[deepest] / max(forces[deepest], 1e-300))
 
 
 def _wall(scene: Scene, contact: Contact, limits: list[Bound]) -> list[Finding]:

@@ -74,6 +74,7 @@ from dano.vision.tracking import (
     Film as Film,
     Overlay as Overlay,
     read_film as read_film,
+    steady_film as steady_film,
     track as track,
     Tracked as Tracked,
     TrackOptions as TrackOptions,

@@ -26,6 +26,9 @@ _SURE = 1.96
 STRONG = 40.0
 """Fall of χ² from which a drift or a slip is believed: 6 numbers without meaning fall it by 6 ± 3.5."""
 
+_DEGREES = (1, 3, 5)
+"""Of a drifting bias as a polynomial of the time."""
+
 _SLIP, _SLIPS = 5e-4, 11
 """Least way of a centre of mass that counts as a slip [m]; moments at which one is looked for."""
 
@@ -50,9 +53,11 @@ class Load:
         force_noise: Standard deviation of a force [N].
         torque_noise: Of a torque [N m].
         joint_bias: Constant part of the torques of an arm's joints [N m], shape (k,); None for the log of a
-            wrist, as are the next two. What belongs to a wrist is NaN for an arm.
+            wrist, as are the other three. What belongs to a wrist is NaN for an arm.
         joint_friction: Of each joint: Coulomb's [N m] and viscous [N m s/rad], shape (k, 2).
         joint_noise: Standard deviation of each joint's torque [N m], shape (k,).
+        joint_drift: How much the bias of each joint changes over the whole log [N m], shape (k,); zeros where
+            it does not.
         unobserved: Which of mass, centre, inertia the log cannot decide.
         messages: What was found odd or corrected, in words.
     """
@@ -71,6 +76,7 @@ class Load:
     joint_bias: np.ndarray | None = None
     joint_friction: np.ndarray | None = None
     joint_noise: np.ndarray | None = None
+    joint_drift: np.ndarray | None = None
 
     def interval(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """95 % interval of "mass", "centre" or "inertia", number by number.
@@ -184,6 +190,36 @@ def _inflation(residuals: np.ndarray) -> float:
     correlation = float(np.sum(above * below) / max(np.sum(residuals**2), 1e-300))
     correlation = min(max(correlation, 0.0), 0.98)
     return (1 + correlation) / (1 - correlation)
+
+
+def drifting(rows: Rows, fit: Fit) -> tuple[Rows, Fit, np.ndarray | None]:
+    """The model and its fit with a bias that changes with time, where that is seen.
+
+    It is a polynomial of the time, of the first degree, or of the third or fifth where these fit better by
+    more than chance: a sensor that warms up drifts fast at first. A drift that ends where it began is not
+    looked for: friction that is not quite that of the model looks like one.
+
+    Args:
+        rows: The model.
+        fit: Its fit.
+
+    Returns:
+        Both, and by how much the bias of each reading changes over the log, shape (r,). Those that came and
+        None where no drift is seen.
+    """
+    count, plain, change = rows.readings.shape[1], rows, None
+    for degree in _DEGREES:
+        powers = [plain.times[:, None, None] ** k * np.eye(count) for k in range(1, degree + 1)]
+        longer = plain.beside(np.concatenate(powers, axis=2))
+        found = fitted(longer, fit.noise)
+        added = longer.table.shape[2] - rows.table.shape[2]
+        if (fit.chi2 - found.chi2) / found.inflation < STRONG + added - 6:
+            break
+        rows, fit = longer, fitted(longer)
+        # From t = -1/2 to 1/2; what is even in t ends where it began.
+        terms = fit.theta[-degree * count :].reshape(degree, count)
+        change = np.sum(terms[::2] * 0.25 ** np.arange((degree + 1) // 2)[:, None], axis=0)
+    return rows, fit, change
 
 
 def check_slip(rows: Rows, fit: Fit, times: np.ndarray) -> None:

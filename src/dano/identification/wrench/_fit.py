@@ -8,13 +8,13 @@ import numpy as np
 from dano.checks import checked_kind
 from dano.identification.wrench._estimate import (
     check_slip,
+    drifting,
     Fit,
     fitted,
     Load,
     load_of,
     Rows,
     shares,
-    STRONG,
     UNSURE,
     wrench_table,
 )
@@ -79,13 +79,19 @@ def identify_load(
                 f" a noise of {other.noise[0]:.2g} N in place of {fit.noise[0]:.2g} N; frame='world' reads"
                 " them so"
             )
-    rows, fit = _drifting(rows, fit, messages)
+    rows, fit, change = drifting(rows, fit)
+    if change is not None:
+        messages.append(
+            f"the bias drifts, by {np.linalg.norm(change[:3]):.2g} N and {np.linalg.norm(change[3:]):.2g} N m"
+            " over the log: estimated along with the rest"
+        )
     if fit.theta[0] < 0:
         messages.append("the log holds what the load does to the sensor: signs are turned")
         rows = dataclasses.replace(rows, readings=-rows.readings)
         fit = dataclasses.replace(fit, theta=-fit.theta)
     _check(log, rows, fit)
-    return load_of(fit, messages, bodies, lambda theta: _sensor(fit, theta))
+    drift = np.zeros(6) if change is None else change
+    return load_of(fit, messages, bodies, lambda theta: _sensor(fit, theta, drift))
 
 
 def _rows(log: WristLog, moved: Twists, gravity: np.ndarray) -> Rows:
@@ -97,12 +103,12 @@ def _rows(log: WristLog, moved: Twists, gravity: np.ndarray) -> Rows:
     return Rows(shares(log.times, rows), readings, table, np.repeat([0, 1], 3))
 
 
-def _sensor(fit: Fit, theta: np.ndarray) -> dict[str, Any]:
+def _sensor(fit: Fit, theta: np.ndarray, drift: np.ndarray) -> dict[str, Any]:
     """Bias, drift and noise, as fields of a load."""
     return {
         "force_bias": theta[10:13],
         "torque_bias": theta[13:16],
-        "drift": theta[16:22] if len(theta) > 16 else np.zeros(6),
+        "drift": drift,
         "force_noise": float(fit.noise[0]),
         "torque_noise": float(fit.noise[1]),
     }
@@ -112,21 +118,6 @@ def _turns(moved: Twists) -> bool:
     """Whether the sensor turned by more than some degrees: else all axes look alike."""
     cosine = np.abs(moved.turn @ moved.turn[0])
     return bool(2 * np.arccos(np.clip(cosine.min(), 0, 1)) > 0.2)
-
-
-def _drifting(rows: Rows, fit: Fit, messages: list[str]) -> tuple[Rows, Fit]:
-    """With a bias that grows with time, where that is seen."""
-    longer = rows.beside(rows.times[:, None, None] * np.eye(6))
-    drifting = fitted(longer, fit.noise)
-    if (fit.chi2 - drifting.chi2) / drifting.inflation < STRONG:
-        return rows, fit
-    drifting = fitted(longer)
-    change = drifting.theta[16:22]
-    messages.append(
-        f"the bias drifts, by {np.linalg.norm(change[:3]):.2g} N and {np.linalg.norm(change[3:]):.2g} N m"
-        " over the log: estimated along with the rest"
-    )
-    return longer, drifting
 
 
 def _check(log: WristLog, rows: Rows, fit: Fit) -> None:

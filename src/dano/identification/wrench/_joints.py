@@ -8,7 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.checks import checked_kind, checked_text
-from dano.identification.wrench._estimate import check_slip, fitted, Load, load_of, Rows, shares, wrench_table
+from dano.identification.wrench._estimate import (
+    check_slip,
+    drifting,
+    fitted,
+    Load,
+    load_of,
+    Rows,
+    shares,
+    wrench_table,
+)
 from dano.identification.wrench._log import surroundings, Twists, twists, WristLog
 from dano.identification.wrench._shape import point_masses
 from dano.maths import checked_numbers, Numbers, quat_to_matrix
@@ -71,7 +80,8 @@ def identify_load_on_arm(log: JointLog, scene: Scene, body: str, *, shape: Numbe
 
     The torques are those of the arm alone, M(q) v̇ + b(q, v) by the scene, and Jᵀ of the force and torque by
     which its link moves the load (see `identify_load`), which are linear in the load. A bias, Coulomb's and
-    viscous friction and the noise of each joint are estimated, too.
+    viscous friction and the noise of each joint are estimated, too; a bias that drifts is reported and
+    estimated.
 
     Args:
         log: The log.
@@ -110,7 +120,14 @@ def identify_load_on_arm(log: JointLog, scene: Scene, body: str, *, shape: Numbe
         np.concatenate([table, *columns], axis=2),
         np.arange(count),
     )
-    fit = fitted(rows)
+    rows, fit, change = drifting(rows, fitted(rows))
+    messages = []
+    if change is not None:
+        largest = int(np.argmax(np.abs(change)))
+        messages.append(
+            f"the bias of the torques drifts, of joint {largest} by {change[largest]:.2g} N m over the"
+            " log: estimated along with the rest"
+        )
     if fit.null[:4].max() < 1e-3 and fit.theta[0] < -3 * np.sqrt(fit.inflation * fit.covariance[0, 0]):
         raise ValueError(
             f"torque must be what drives the joints, with their signs: with these the load has a mass of"
@@ -119,8 +136,10 @@ def identify_load_on_arm(log: JointLog, scene: Scene, body: str, *, shape: Numbe
     if fit.null[:4].max() < 1e-3 and fit.theta[0] > 0:
         check_slip(rows, fit, log.times)
 
+    drift = np.zeros(count) if change is None else change
+
     def sensor(theta: np.ndarray) -> dict:
-        nothing, joints = np.full(3, np.nan), theta[10:].reshape(3, count)
+        nothing, joints = np.full(3, np.nan), theta[10 : 10 + 3 * count].reshape(3, count)
         return {
             "force_bias": nothing,
             "torque_bias": nothing,
@@ -130,9 +149,10 @@ def identify_load_on_arm(log: JointLog, scene: Scene, body: str, *, shape: Numbe
             "joint_bias": joints[0],
             "joint_friction": joints[1:].T,
             "joint_noise": fit.noise,
+            "joint_drift": drift,
         }
 
-    return load_of(fit, [], points, sensor)
+    return load_of(fit, messages, points, sensor)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
