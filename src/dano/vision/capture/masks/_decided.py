@@ -55,7 +55,7 @@ def decided_by_colours(
     found = []
     for view, mask, share, gain in zip(views, covered, shown, top.gain, strict=True):
         behind = shown_by(view, top, gain)
-        doubt = _around(mask > 0.5) | ((share > 0.5) & (mask < 0.5)) | _like(view, behind)
+        doubt = _around(mask > 0.5) | ((share > 0.5) & (mask < 0.5)) | (_like(view, behind) & (mask > 0.5))
         found.append(
             view.replaced(mask=mask.astype(np.float32), behind=behind, doubt=doubt.astype(np.float32))
         )

@@ -30,10 +30,7 @@ _ELSE = 0.05
 """Share of the pixels that show anything, such as another thing on the table."""
 
 _MOST = 4.0
-"""That one pixel says for the object: colours of neighbours depend on each other."""
-
-_AGAINST = 1.5
-"""The same for the table: a patch of an object may have its colours."""
+"""That one pixel says: colours of neighbours depend on each other."""
 
 GAUSSIAN = 1.4826
 """Standard deviation over the median of deviations, of a normal distribution."""
@@ -229,4 +226,4 @@ def evidence_of(
     of_thing, of_table = (h[place[..., 0], place[..., 1], place[..., 2]] for h in (thing, table))
     of_table = np.where(known, there.prod(axis=-1), of_table)
     ratio = ((1 - _ELSE) * of_thing + _ELSE) / ((1 - _ELSE) * of_table + _ELSE)
-    return np.clip(np.log(ratio), -_AGAINST, _MOST)
+    return np.clip(np.log(ratio), -_MOST, _MOST)
