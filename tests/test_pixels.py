@@ -215,7 +215,38 @@ def test_friction_is_found_from_pixels(scene, look, watched, tmp_path):
     assert abs(after / 0.3 - 1) < 0.02
     assert abs(after - 0.3) < 0.5 * abs(before - 0.3)
     assert len(found.history) >= 3
+    assert found.fit.standard_errors["mu"] >= found.poses.standard_errors["mu"]
     check_page(found, taken, look, camera, tmp_path)
+
+
+@pytest.mark.slow
+def test_pixels_that_repeat_the_poses_end_the_search(scene, look, watched):
+    """Poses that are right leave the pixels nothing to add: one value, one error, one pass."""
+    taken, camera, motion = watched
+    right = Motion.create(
+        motion.times,
+        "ball",
+        position=motion.position[:, 0],
+        orientation=motion.orientation[:, 0],
+        covariance=np.tile(np.diag([0.015**2] * 3 + [0.05**2] * 3), (len(motion.times), 1, 1)),
+        point="origin",
+    )
+    found = identify_in_film(
+        scene,
+        taken,
+        look,
+        camera,
+        right,
+        [dano.Parameter("mu", lambda s: s.contact("ball", "floor").sliding_friction, 0.05, 1.0)],
+        tracking=TrackOptions(masks="given", rays=1500),
+        initial="velocities",
+    )
+    assert found.settled and len(found.history) == 2
+    assert found.fit is found.poses
+    assert abs(float(found.fit.values["mu"]) / 0.3 - 1) < 0.02
+    # What the pixels of that pass said is there to be compared.
+    moved = float(found.history[1]["mu"]) - float(found.history[0]["mu"])
+    assert abs(moved) < 0.3 * float(found.fit.standard_errors["mu"])
 
 
 def check_page(found, taken, look, camera, folder):

@@ -95,7 +95,15 @@ def train_object(
         capture = capture.thinned(views)
 
     say("visual hull", 0.0)
-    trained = train(capture, options, checkpoint=checkpoint, resume=resume, progress=say, previews=previews)
+    trained = train(
+        capture,
+        options,
+        table=table,
+        checkpoint=checkpoint,
+        resume=resume,
+        progress=say,
+        previews=previews,
+    )
     if table is not None:
         trained = trained._replace(field=trained.field.above(table))
     say("solid", 0.0)

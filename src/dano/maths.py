@@ -292,18 +292,24 @@ def einsum(subscripts: str, *arrays: AnyArray) -> Any:
     return jnp.einsum(subscripts, *arrays, precision=_ALL_DIGITS)
 
 
-def matvec(a: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
+def matvec(a: Float[AnyArray, "m n"], x: Float[AnyArray, " n"]) -> Float[AnyArray, " m"]:
     """``a @ x`` for a small matrix."""
     return matmul(a, x[:, None])[:, 0]
 
 
-@jax.custom_jvp
-def matmul(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"]:
-    """``a @ b`` for small matrices."""
+def matmul(a: Float[AnyArray, "m k"], b: Float[AnyArray, "k n"]) -> Float[AnyArray, "m n"]:
+    """``a @ b`` for small matrices; rounded in one way by NumPy and JAX."""
+    return _written_out(a, b) if library(a, b) is np else _matmul(jnp.asarray(a), jnp.asarray(b))
+
+
+def _written_out(a: AnyArray, b: AnyArray) -> AnyArray:
     return sum((a[:, i, None] * b[None, i] for i in range(1, a.shape[1])), a[:, 0, None] * b[None, 0])
 
 
-@functools.partial(matmul.defjvp, symbolic_zeros=True)
+_matmul = jax.custom_jvp(_written_out)
+
+
+@functools.partial(_matmul.defjvp, symbolic_zeros=True)
 def _matmul_jvp(primals, tangents):
     # Tangents as one product and one reduction: their transposes are as short, those of the written-out sum
     # are not.
@@ -317,7 +323,7 @@ def _matmul_jvp(primals, tangents):
         if d is not None
     ]
     tangent = jnp.sum(sum(terms[1:], terms[0]), axis=1) if terms else jnp.zeros_like(a[:, :1] * b[:1])
-    return matmul(a, b), tangent
+    return _matmul(a, b), tangent
 
 
 def _zero(tangent) -> bool:
@@ -359,7 +365,7 @@ class Pose(eqx.Module):
         return turned + jnp.broadcast_to(self.position.astype(x.dtype), x.shape)
 
     @property
-    def matrix(self) -> Float[Array, "3 3"]:
+    def matrix(self) -> Float[AnyArray, "3 3"]:
         """Rotation matrix."""
         return quat_to_matrix(self.orientation)
 

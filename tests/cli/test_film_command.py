@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from vision import sliding_box, tabletop
 
 from dano.cli.film import Film, STAGES
 from dano.cli.film._after import stages_after
 from dano.cli.film._before import stages_before
+from dano.cli.film._grades import Grade, grades_of, Verdict, verdict_of, write_verdict
 from dano.cli.film._place import place_of
 from dano.cli.film._slide import find_slide
 from dano.cli.film._stages import run_stages, Stage
-from dano.identification import Motion
+from dano.identification import Motion, save_motion
 
 
 class Kitchen:
@@ -57,7 +59,15 @@ class Kitchen:
 
         return make
 
-    def run(self, **asked: str) -> list[str]:
+    def judge(self, stage: str, text: str, good: bool) -> None:
+        """Let a stage say how good it is from now on."""
+        made = self.stages
+        self.stages = lambda: [
+            dataclasses.replace(each, judge=(lambda: (text, good)) if each.name == stage else each.judge)
+            for each in made()
+        ]
+
+    def run(self, **asked) -> list[str]:
         self.said.clear()
         self.went_on.clear()
         record = self.folder / "stages.json"
@@ -148,6 +158,112 @@ def test_a_stage_that_leaves_nothing_has_failed(kitchen: Kitchen):
         run_stages(stages, kitchen.folder / "stages.json", tell=kitchen.said.append)
 
 
+def test_a_stage_that_is_too_bad_ends_it_unless_forced(kitchen: Kitchen):
+    kitchen.judge("cut", "9 % are stones", False)
+    refused = r"^stage cut: 9 % are stones, what follows would be wrong\. Sharpen the cut; --force goes on"
+    with pytest.raises(ValueError, match=refused):
+        kitchen.run()
+    assert not (kitchen.folder / "cook").exists()
+    # It is not made again, but stops again.
+    with pytest.raises(ValueError, match=refused):
+        kitchen.run()
+    assert kitchen.went_on == []
+    # Nothing follows.
+    assert kitchen.run(last="cut") == [] and kitchen.said[-1] == "cut (1 of 3): 9 % are stones"
+    assert kitchen.run(force=True) == ["cook", "serve"]
+    kitchen.judge("cut", "no stones", True)
+    assert kitchen.run() == [] and kitchen.said[1] == "cut (1 of 3): no stones"
+
+
+def test_a_friction_is_as_wide_as_what_it_was_made_of():
+    clean = Verdict.of(0.3, 0.004, 0.9, 0.02, 0.0025)
+    assert clean.error == pytest.approx(np.hypot(0.004, 0.3 * 0.0025))
+    missed = Verdict.of(0.3, 0.004, 4.2, 0.02, 0.0)
+    assert missed.error == pytest.approx(4.2 * 0.004)
+    shredded = Verdict.of(0.3, 0.004, 1.0, 0.13, 0.0)
+    assert shredded.error == pytest.approx(np.hypot(0.004, 0.3 * 0.1))
+    assert Verdict.of(0.3, None, 1.0, 0.0, 0.0).error is None
+
+
+def test_a_number_is_good_up_to_what_is_usual_and_one_that_is_not_known_is_poor():
+    marks = [Grade("masks", "holes", value, 0.02, 0.12).mark for value in (0.02, 0.07, 0.13, np.nan)]
+    assert marks == ["good", "fair", "poor", "poor"]
+    assert Grade("masks", "holes", 0.074, 0.02, 0.12).text == "7.4 % (fair; up to 2 % is usual)"
+
+
+def test_the_last_page_shows_all_numbers_and_which_not_to_believe(inputs: Film):
+    place = place_of(inputs)
+    place.folder.mkdir()
+    left = {
+        "check": {"walk": {"looked_at": 10, "marked": 8}},
+        "cameras": {"reprojection_error": 0.7},
+        "fit": {"residual": 0.074},
+        "object": {"unexplained": 0.15},
+        "motion": {"quality": 0.97},
+        "friction": {
+            "values": {"my_soap,table.sliding_friction": 0.3},
+            "standard_errors": {"my_soap,table.sliding_friction": 0.004},
+            "errors": {"rms": 4.2},
+        },
+    }
+    for name, content in left.items():
+        (place.folder / f"{name}.json").write_text(json.dumps(content), encoding="utf-8")
+    steps = 8
+    slid = Motion.create(
+        np.arange(steps) / 30,
+        "my_soap",
+        position=np.zeros((steps, 3)),
+        orientation=np.tile([1.0, 0, 0, 0], (steps, 1)),
+        covariance=np.tile(1e-6 * np.eye(6), (steps, 1, 1)),
+        alike=(0.01, 0.006, 0.02),
+        point="origin",
+    )
+    save_motion(place.folder / "slide.npz", slid)
+    grades = grades_of(place, STAGES[:-1])
+    assert [grade.mark for grade in grades] == ["good", "good", "fair", "poor", "good", "poor"]
+    assert grades[0].value == pytest.approx(0.2) and grades[4].value == pytest.approx(0.03)
+    verdict = verdict_of(place)
+    assert verdict.error == pytest.approx(np.linalg.norm([4.2 * 0.004, 0.3 * 0.02, 0.3 * 0.12]))
+    write_verdict(place.folder / "summary.html", place, grades, verdict)
+    page = (place.folder / "summary.html").read_text(encoding="utf-8")
+    assert "Friction 0.3 ± 0.04 (the fit alone says ± 0.004)" in page
+    assert page.count("should not be believed") == 2 and "7.4 % (fair" in page
+
+
+@pytest.mark.slow
+def test_photographs_with_masks_that_do_not_fit_together_end_it(run, tmp_path: Path):
+    walk, film, _ = sliding_box.write_story(tmp_path)
+    cameras = [tabletop.camera(2 * np.pi * i / 20, 0.55 + 0.45 * (i % 2), 0.30) for i in range(20)]
+    folder = tmp_path / "box_film"
+    folder.mkdir()
+    frames = [
+        {
+            "file_path": f"../walk/images/{i:03d}.png",
+            "mask_path": f"../walk/masks/{i:03d}.png",
+            "fl_x": float(seen.focal[0]),
+            "transform_matrix": np.vstack([seen.pose, [0, 0, 0, 1]]).tolist(),
+        }
+        for i, seen in enumerate(cameras)
+    ]
+    for name in ("cameras", "camera", "photographs"):
+        (folder / f"{name}.json").write_text(json.dumps({"units": "m", "frames": frames}))
+    (folder / "check.json").write_text("{}")
+    words = ("film", walk, film, "--marker-size", tabletop.TAG_SIDE, "-o", tmp_path / "box.dano")
+    words += ("--from", "masks", "--to", "object", "--resolution", 16, "--iterations", 3)
+    fine = run(*words)
+    assert fine.code == 0 and "(good; up to 2 % is usual)" in fine.err, fine.err
+    # Every second mask is that of another photograph.
+    for i in range(0, 20, 2):
+        other = walk / "masks" / f"{(i + 5) % 20:03d}.png"
+        (walk / "masks" / f"{i:03d}.png").write_bytes(other.read_bytes())
+    stopped = run(*words)
+    assert stopped.code == 2, stopped.err
+    assert "stage masks: silhouettes that no solid explains" in stopped.err
+    assert "--force goes on anyway" in stopped.err
+    forced = run(*words, "--force")
+    assert "(poor; up to 2 % is usual)" in forced.err and "object (4 of 7): learning" in forced.err
+
+
 def test_a_broken_record_is_no_reason_to_fail(kitchen: Kitchen):
     kitchen.run()
     (kitchen.folder / "stages.json").write_text('{"stages": {"cut": 3}}', encoding="utf-8")
@@ -203,7 +319,7 @@ def test_stages_are_those_that_options_name_and_each_reads_what_others_write(inp
     given = {inputs.slide, *place.photographs}
     for stage in stages:
         read = {path for paths in stage.files.values() for path in paths}
-        assert read <= given | {place.folder / "masks"}, stage.name
+        assert read <= given | {place.folder / "masks", place.folder / "doubts"}, stage.name
         given |= set(stage.outputs)
     # What is asked of training is no reason to find cameras again.
     other = place_of(dataclasses.replace(inputs, resolution=32, release=0.2))

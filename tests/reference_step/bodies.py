@@ -22,6 +22,7 @@ class Bodies(NamedTuple):
         spin: [rad/s, W], the same.
         gain: What gravity adds to the velocity of a body that falls freely [m/s, W], shape (n, 3).
         spin_gain: What gyroscopic torques add to its spin [rad/s, W], shape (n, 3).
+        falls: `gain` without what supports a body.
         inverse_mass: 1/m, zero for a fixed body [1/kg].
         inverse_inertia: [1/(kg m²), W], the same.
     """
@@ -40,6 +41,7 @@ class Bodies(NamedTuple):
     spin: np.ndarray
     gain: np.ndarray
     spin_gain: np.ndarray
+    falls: np.ndarray
     inverse_mass: np.ndarray
     inverse_inertia: np.ndarray
 
@@ -50,6 +52,9 @@ class Bodies(NamedTuple):
         step before; quaternions move on the chord between start and end, normalised.
         """
         q = self.orientation[i] + share * (self.ahead[i] - self.orientation[i])
+        # Spins are those of half a step before, too: the turn is less than that share of the whole one.
+        lag = -0.25 * share * (1 - share) * self.h * self.spin_gain[i]
+        q = multiply(np.r_[1, lag] / np.sqrt(1 + lag @ lag), q)
         start = self.velocity[i] + 0.5 * self.gain[i]
         way = share * self.h * (start + 0.5 * share * self.gain[i])
         return self.position[i] + way, matrix(q / np.linalg.norm(q))
@@ -66,7 +71,18 @@ class Bodies(NamedTuple):
 
     def held(self):
         """Bodies whose velocities gain nothing."""
-        return self._replace(gain=0 * self.gain, spin_gain=0 * self.spin_gain)
+        return self._replace(gain=0 * self.gain, spin_gain=0 * self.spin_gain, falls=0 * self.falls)
+
+    def supported(self, impulses):
+        """Bodies that fall and feel an impulse and its moment meanwhile [N s, N m s; W], shape (n, 6)."""
+        gain = self.inverse_mass[:, None] * impulses[:, :3]
+        spins = np.einsum("nij,nj->ni", self.inverse_inertia, impulses[:, 3:])
+        spin_gain = self.spin_gain + spins
+        ahead = np.array(self.ahead)
+        for i in np.flatnonzero(self.moves):
+            own = matrix(self.orientation[i]).T @ (self.spin[i] + spin_gain[i])
+            ahead[i] = multiply(self.orientation[i], turn(own, self.h))
+        return self._replace(gain=self.gain + gain, spin_gain=spin_gain, ahead=ahead)
 
     def relative(self, i, j):
         """Velocity [m/s] of centre of mass i and spin [rad/s] relative to body j as a rigid frame [W]."""
@@ -109,6 +125,7 @@ def read(scene, state):
         spin=np.einsum("nij,nj->ni", rotations, omega),
         gain=np.where(falls[:, None], h * np.asarray(scene.gravity), 0),
         spin_gain=np.einsum("nij,nj->ni", rotations, gains),
+        falls=np.where(falls[:, None], h * np.asarray(scene.gravity), 0),
         inverse_mass=np.where(moves, 1 / mass, 0),
         inverse_inertia=np.array(
             [m * R @ np.linalg.inv(J) @ R.T for m, R, J in zip(moves, rotations, inertia, strict=True)]

@@ -39,7 +39,10 @@ class Points(NamedTuple):
         depth: d of the law [m], shape (n,).
         rate: v_n⁻ [m/s].
         meets: v_n when bodies meet [m/s].
-        gains: What gravity adds to v_n from then to the middle of the step [m/s].
+        gains: What gravity adds to the velocity from then to the middle of the step [m/s], shape (3,).
+        after: How long that is [s], below zero where they meet later.
+        turns: Q and q of how points at r accelerate by turning after an impact, Q r + q [m/s²].
+        support: Impulse of what the side rests on in a step, on the first body [N s, N m s], shape (6,).
         area: A [m²].
         drift: ½ ω⁻ × (r₁ − r₀), its tangential part limited [m/s], shape (n, 3).
         impact: κ w [Pa s/m], zero where there is no impact, shape (n,).
@@ -50,6 +53,8 @@ class Points(NamedTuple):
         beta: Share of the contact that is an impact.
         delays: Impulses take effect after this share of τ.
         way: Share of the step in which bodies go on as before.
+        part: Share of an impact that the side carries.
+        left_out: Share of a sample that rests which has no part in an impact.
     """
 
     first: int
@@ -64,6 +69,9 @@ class Points(NamedTuple):
     rate: np.ndarray
     meets: np.ndarray
     gains: np.ndarray
+    after: float
+    turns: tuple[np.ndarray, np.ndarray]
+    support: np.ndarray
     area: np.ndarray
     drift: np.ndarray
     impact: np.ndarray
@@ -74,6 +82,8 @@ class Points(NamedTuple):
     beta: float
     delays: float
     way: float
+    part: float
+    left_out: float
 
 
 def sides_of(scene):
@@ -223,6 +233,8 @@ class Meeting(NamedTuple):
     hits: bool = False
     lasts: bool = False
     falls: bool = False
+    support: np.ndarray = np.zeros(6)
+    left_out: float = 0.0
 
 
 def meetings(scene, bodies, side):
@@ -232,10 +244,121 @@ def meetings(scene, bodies, side):
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
-    bodies = bodies.falling()
+    raw, bodies = bodies, bodies.falling()
     since = -1.0 if is_alone(scene, bodies, side) else 0.0
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
-    return Meeting(share, hits=bool(share < 1), falls=nears(scene, bodies, side, delta, slow)), lasting
+    falls = nears(scene, bodies, side, delta, slow)
+    support, left_out = np.zeros(6), 0.0
+    if since and share < 1 and falls:
+        rest = rest_of(scene, raw, side, delta)
+        if rest is not None:
+            near, depth, arm, normal = rest
+            support = smooth_step(near) * support_of(scene, bodies, side, arm, normal)
+            left_out = smooth_step(near) * min(side.law.F / 1e4, 1.0) * bool(np.any(support))
+            held = bodies.supported(on_bodies(bodies, side.i, side.j, support))
+            share = share_at(scene, held, side, delta + 2 * depth, bodies.h * slow, slow, since)
+            falls = nears(scene, held, side, delta, slow)
+    return Meeting(share, bool(share < 1), falls=falls, support=support, left_out=left_out), lasting
+
+
+def on_bodies(bodies, i, j, impulse):
+    """An impulse on body i at its centre of mass, and back on body j, shape (n, 6)."""
+    found = np.zeros((len(bodies.mass), 6))
+    away = bodies.position[i] - bodies.position[j]
+    found[i] = impulse
+    found[j] = -np.r_[impulse[:3], impulse[3:] + np.cross(away, impulse[:3])]
+    return found
+
+
+def rest_of(scene, bodies, side, delta):
+    """What a side rests on at the start of the step: its nearness, depth, arm and normal; None if nothing.
+
+    Samples count by the cube of how near they are over δ and what bodies fall by in a step, slow ones alone.
+    """
+    pair = Pair(scene, bodies, side, 0.0)
+    distance, normal = pair.distance(pair.places)
+    facing = -np.sum(pair.vectors * normal, axis=1)
+    if pair.turning != "fixed":
+        normal = rounded(pair, normal)
+    u, w = bodies.relative(side.i, side.j)
+    after, arm, moment = levers(scene, bodies, side, 0.0, pair, normal)
+    approach = normal @ u + moment @ w
+    if pair.turning != "fixed":
+        approach = approach - np.sum(normal * drifts(u, w, after, arm, normal), axis=1)
+    fall = delta + 0.5 * bodies.h * np.linalg.norm(bodies.falls[side.i] - bodies.falls[side.j])
+    speed = approach / side.law.slowest_rebound
+    slow = (1 - smooth_step(-speed - 1)) * (1 - smooth_step(speed))
+    near = np.clip(1 - distance / fall, 0, 2)
+    weights = near**3 * slow * (facing > 0) * (distance < fall)
+    if weights.sum() == 0:
+        return None
+    weights = weights / weights.sum()
+    return weights @ near, weights @ np.maximum(-distance, 0), weights @ arm, weights @ normal
+
+
+def mover(bodies, side, arm, normal):
+    """The body of a side that moves, the other being fixed: sign, index, arm, unit normal, mobility there."""
+    sign, k = (1, side.i) if bodies.moves[side.i] else (-1, side.j)
+    r = arm if sign == 1 else arm + bodies.position[side.i] - bodies.position[side.j]
+    K = cross_matrix(r)
+    return (
+        sign,
+        k,
+        r,
+        sign * unit(normal),
+        bodies.inverse_mass[k] * np.eye(3) - K @ bodies.inverse_inertia[k] @ K,
+    )
+
+
+def stopping(velocity, mobility, normal, mu):
+    """Impulse that stops a point, or, where that is beyond friction, its motion along the normal [N s]."""
+    impulse = np.linalg.solve(mobility, -velocity)
+    presses = normal @ impulse
+    across = impulse - presses * normal
+    size = np.linalg.norm(across)
+    if size <= mu * presses:
+        return impulse
+    along = normal + mu * across / size
+    slows = max(normal @ mobility @ along, 0.05 * normal @ mobility @ normal)
+    return max(-normal @ velocity, 0) / slows * along
+
+
+def turning_of(scene, bodies, side, k, velocity, spin):
+    """Q and q: how points at r from the first centre of mass accelerate because body k turns, Q r + q [m/s²].
+
+    Of what is fixed to the first body: ω × (ω × r) + γ × r. Where the second moves, its surface passes a
+    point at rest, so that the arm from its centre changes by −v.
+    """
+    inverse = bodies.inverse_inertia[k]
+    gyroscopic = cross_matrix(-inverse @ np.cross(spin, np.linalg.solve(inverse, spin)))
+    if k == side.i:
+        turning = scene.bodies[k].surface.turning
+        axis = bodies.pose(k, 0)[1][:, 2]
+        follows = {"fixed": spin, "axis": spin - (spin @ axis) * axis, "ball": 0 * spin}[turning]
+        return cross_matrix(follows) @ cross_matrix(follows) + gyroscopic * (turning == "fixed"), np.zeros(3)
+    Q = cross_matrix(spin) @ cross_matrix(spin) - gyroscopic
+    return Q, Q @ (bodies.position[side.i] - bodies.position[side.j]) + 2 * np.cross(spin, velocity)
+
+
+def support_of(scene, bodies, side, arm, normal):
+    """Impulse of a point that a side rests on in a step, on the first body [N s, N m s]."""
+    sign, k, r, n, mobility = mover(bodies, side, arm, normal)
+    Q, q = turning_of(scene, bodies, side, k, bodies.velocity[k], bodies.spin[k])
+    bends = sign * (Q @ arm + q)
+    moves = bodies.velocity[k] + np.cross(bodies.spin[k], r) - 0.5 * bodies.h * bends
+    moves = moves - min(n @ moves, 0) * n
+    impulse = sign * stopping(bodies.gain[k] + bodies.h * bends + moves, mobility, n, side.law.mu)
+    return np.r_[impulse, np.cross(arm, impulse)]
+
+
+def turns_after(scene, bodies, side, share, arm, normal):
+    """Q and q after an impact at an arm, of a body with one that is fixed."""
+    _, k, r, n, mobility = mover(bodies, side, arm, normal)
+    v = bodies.velocity[k] + (0.5 + share) * bodies.gain[k]
+    w = bodies.spin[k] + (0.5 + share) * bodies.spin_gain[k]
+    impulse = stopping(v + np.cross(w, r), mobility, n, side.law.mu)
+    w = w + bodies.inverse_inertia[k] @ np.cross(r, impulse)
+    return turning_of(scene, bodies, side, k, v + bodies.inverse_mass[k] * impulse, w)
 
 
 def is_alone(scene, bodies, side):
@@ -364,6 +487,8 @@ def unit_rows(vectors):
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
     bodies = bodies.falling() if met.falls else bodies.held()
+    if met.falls:
+        bodies = bodies.supported(on_bodies(bodies, side.i, side.j, met.support))
     i, j, h, share = side.i, side.j, bodies.h, met.share
     pair = Pair(scene, bodies, side, share)
     distance, normal = pair.distance(pair.places)
@@ -397,12 +522,18 @@ def listed(scene, bodies, side, met):
     hit = usual & (sunk > 0)
     approach = rate - np.sum(normal * drift, axis=1)
     x = sunk / delta
-    weight = fading_in(x) * hit
-    near_load = area * usual * fading_in(1 + before / delta)
+    left_out = met.left_out * met.falls
+    counts = 1 - (1 - smooth_step(-approach / side.law.slowest_rebound - 1)) * left_out
+    weight = fading_in(x) * hit * counts
+    near_load = area * usual * fading_in(1 + before / delta) * counts
     beta, stiffness = 0.0, 0.0
     if not met.lasts:
         beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
-    delays = beta * (is_alone(scene, bodies, side) and met.hits)
+    alone = is_alone(scene, bodies, side) and met.hits
+    delays, turns = beta * alone, (np.zeros((3, 3)), np.zeros(3))
+    if delays > 0:
+        load = area * weight / (area * weight).sum()
+        turns = turns_after(scene, bodies, side, share, load @ arm, load @ normal)
     return Points(
         first=i,
         second=j,
@@ -415,7 +546,10 @@ def listed(scene, bodies, side, met):
         depth=depth[kept],
         rate=rate[kept],
         meets=(approach + (0.5 + share) * (gain + spin_gain))[kept],
-        gains=((0.5 - share) * gain)[kept],
+        gains=(0.5 - share) * (bodies.falls[i] - bodies.falls[j]),
+        after=(0.5 - share) * h * met.hits,
+        turns=turns,
+        support=met.support * met.falls,
         area=area[kept],
         drift=drift[kept],
         impact=(stiffness * met.hits * weight)[kept],
@@ -426,6 +560,8 @@ def listed(scene, bodies, side, met):
         beta=beta,
         delays=delays,
         way=(1 - delays) * max(share, 0) * met.hits,
+        part=1.0,
+        left_out=left_out,
     )
 
 
@@ -488,7 +624,7 @@ def halved(found):
     """Sides whose impacts both bodies' samples have part in, with half of it each."""
     hits = {(points.first, points.second) for points in found if np.any(points.impact > 0)}
     return [
-        points._replace(impact=points.impact / 2, kappa=points.kappa / 2)
+        points._replace(impact=points.impact / 2, kappa=points.kappa / 2, part=0.5)
         if (points.second, points.first) in hits
         else points
         for points in found

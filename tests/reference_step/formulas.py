@@ -65,6 +65,8 @@ def traction(material: dict[str, float], points, rate, slip):
     of_impact["deepest"], of_impact["part"], of_impact["way"] = points.deepest, 1.0, points.way
     of_impact["delays"], of_impact["rest"] = points.delays, material["timestep"]
     of_impact["rest"] *= 1 - points.delays * points.share
+    of_impact["after"], of_impact["rests"] = points.after, points.left_out
+    of_impact["turns"]["by_arm"], of_impact["turns"]["offset"] = points.turns
     rows["approach"] = points.rate - np.sum(points.drift * points.normal, axis=1)
     rows["meets"], rows["gains_after"] = points.meets, points.gains
     of_material = np.zeros(n, point_law.Material.numpy_dtype())

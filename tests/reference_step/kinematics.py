@@ -7,6 +7,7 @@ coordinate. Poses are functions of what a step makes of them, x(q ⊕ h y); all 
 import jax
 import numpy as np
 from reference_step.bodies import read
+from reference_step.collision import on_bodies, unit
 from reference_step.rotations import (
     conjugate,
     exponential,
@@ -45,6 +46,7 @@ class Kinematics:
         self.hangs = {self.names.index(joint.child): joint for joint in self.joints}
         moves = self.bodies.moves
         self.met, self.lead = np.zeros(len(self.names)), np.ones(len(self.names))
+        self.supports = np.zeros((len(self.names), 6))
         self.free = [i for i in range(len(self.names)) if moves[i] and i not in self.hangs]
         self.joint_rows, size = {}, 6 * len(self.free)
         for joint in self.joints:
@@ -186,12 +188,16 @@ class Kinematics:
                 R.T @ before[3:], J, h, -1
             )
             gained[i] = np.r_[bodies.mass[i] * (v[:3] - before[:3] - h * bodies.gravity), spin]
+            gained[i] -= self.supports[i]
             if control is not None:
                 gained[i] -= h * np.r_[np.asarray(control.force)[i], np.asarray(control.torque)[i]]
         return gained
 
     def balance_when_met(self, found):
-        """Take when bodies meet fixed ones, the mean of several moments, from the listed points of sides."""
+        """Take when bodies meet fixed ones, the mean of several moments, and what they rest on until then."""
+        for p in found:
+            until = p.part * p.delays * (0.5 + p.share)
+            self.supports += until * on_bodies(self.bodies, p.first, p.second, p.support)
         for i in self.free:
             waiting = [(p.delays * p.share, p.delays) for p in found if p.delays > 0 and i in p[:2]]
             if waiting:
@@ -199,7 +205,8 @@ class Kinematics:
 
     def rotation_met(self, i):
         """Rotation of a body when its angular momentum is balanced."""
-        return self.bodies.falling().pose(i, self.met[i])[1]
+        q, ahead = self.bodies.orientation[i], self.bodies.ahead_falling[i]
+        return matrix(unit(q + self.met[i] * (ahead - q)))
 
     def inertia_met(self, i):
         """Its inertia then [kg m², W]."""

@@ -159,13 +159,45 @@ def pressure(law, points, rate, v_s):
     return lasting * p + blow, lasting * slope - points.impact * (missing > 0) - points.kappa * (below > 0)
 
 
+def gained(law, points):
+    """What velocities gain from an impact to the middle of the step: of points that leave, and what differs.
+
+    The latter is that of points that stay: they accelerate along the normal no more, and across it no more
+    than friction lets them, which turning does to what is fixed to a body. What turning takes away leaves.
+    """
+    Q, q = points.turns
+    leaves = np.broadcast_to(points.gains, points.arm.shape)
+    differs = -points.after * (points.arm @ Q.T + q) - leaves
+    along = np.sum(points.normal * differs, axis=1)
+    across = differs - along[:, None] * points.normal
+    size = np.linalg.norm(across, axis=1)
+    share = np.minimum(1, law.mu * np.abs(along) / np.where(size > 0, size, 1))
+    stays = (along * points.after > 0)[:, None] * (along[:, None] * points.normal + share[:, None] * across)
+    return leaves, stays
+
+
+def rebounds(law, points):
+    """Speeds of rebounds [m/s], and the share of each that counts."""
+    rebound = -law.e * points.meets
+    return rebound, smooth_step(2 * rebound / law.slowest_rebound - 1)
+
+
 def goals(law, points):
     """v*: separating speeds that points aim at in an impact [m/s]."""
     approach = points.rate - np.sum(points.normal * points.drift, axis=1)
-    rebound = -law.e * points.meets
-    fast = smooth_step(2 * rebound / law.slowest_rebound - 1)
-    after = fast * (rebound + points.gains) + (1 - fast) * points.way * np.minimum(approach, 0)
+    rebound, fast = rebounds(law, points)
+    leaves, stays = (np.sum(points.normal * x, axis=1) for x in gained(law, points))
+    lasts = points.delays * (leaves + stays) + points.way * np.minimum(approach, 0)
+    after = fast * (rebound + leaves) + (1 - fast) * lasts
     return after + np.maximum(after - approach, 0) / law.F
+
+
+def extra_slip(law, points):
+    """What is added to velocities before the slip is taken of them [m/s, W]."""
+    if not np.any(points.impact > 0):
+        return points.drift
+    leaves, stays = gained(law, points)
+    return points.drift - points.delays * (leaves + (1 - rebounds(law, points)[1])[:, None] * stays)
 
 
 def smooth_step(x):
@@ -193,7 +225,7 @@ def wrench(points, velocities, softness=1.0):
     away, n, A = points.com_difference, points.normal, points.area[:, None]
     u, w = np.split(relative(points) @ velocities[[points.first, points.second]].ravel(), 2)
     rate = n @ u + points.moment @ w
-    full = u + points.drift - points.arm @ cross_matrix(w)  # u + w × r
+    full = u + extra_slip(points.law, points) - points.arm @ cross_matrix(w)  # u + w × r
     slip = full - np.sum(full * n, axis=1, keepdims=True) * n
     found = traction(points.law, points, rate, slip, softness)
     press = np.concatenate([n, points.moment], axis=1)  # what a unit pressure does, and ∂v_n/∂(twist)

@@ -1,7 +1,7 @@
 """One step: docs/theory/integrator.md. Everything is a root R(y) = 0, searched with a plain Newton method."""
 
 import numpy as np
-from reference_step.collision import find
+from reference_step.collision import find, on_bodies
 from reference_step.joint_law import JointLaw
 from reference_step.kinematics import Kinematics
 from reference_step.law import relative, wrench
@@ -92,10 +92,12 @@ class Step:
         for points in self.points:
             if points.delays:
                 done = wrench(points, k.seen(y))
+                rests = on_bodies(k.bodies, points.first, points.second, points.support)
+                rests *= 0.5 * points.share**2 * points.part
                 for i, impulse in ((points.first, done.first), (points.second, done.second)):
                     if i in k.free:
                         at = 6 * k.free.index(i)
-                        late = points.delays * points.share * k.h * impulse
+                        late = points.delays * (points.share * k.h * impulse + rests[i])
                         found[at : at + 3] -= k.bodies.inverse_mass[i] * late[:3]
                         found[at + 3 : at + 6] -= np.linalg.solve(k.inertia_met(i), late[3:])
         return found

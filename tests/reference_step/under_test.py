@@ -68,7 +68,7 @@ def _listed(scene, state):
 
 def _find(scene, state):
     """The search of the kernels."""
-    if not scene.point_pairs:
+    if not len(scene.point_pairs):
         return {}
     listed = {name: np.asarray(x) for name, x in _listed(scene, state).items()}
     assert not listed.pop("overflow")

@@ -12,6 +12,7 @@ from dano.planning import GoalError, Plan
 from dano.solvers import Stop
 from dano.vision import (
     Capture,
+    Doubt,
     Film,
     HistoryEntry,
     LearnedField,
@@ -110,6 +111,7 @@ def tracked(frames: int = 3) -> Tracked:
         position=position,
         orientation=orientation,
         covariance=np.tile(1e-6 * np.eye(6), (frames, 1, 1)),
+        own=np.tile(1e-6 * np.eye(6), (frames, 1, 1)),
         status=("tracked",) * (frames - 1) + ("lost",),
         quality=np.full(frames, 0.9),
         colour_error=np.full(frames, 0.02),
@@ -119,6 +121,7 @@ def tracked(frames: int = 3) -> Tracked:
         messages=("this <is> made up",),
         seconds=0.1,
         repeats=np.ones(frames),
+        doubt=Doubt(),
     )
 
 
@@ -133,7 +136,7 @@ def trained(field: LearnedField, photographs: Capture, box: NodeGrid, hull: np.n
     history = (HistoryEntry(100, 200, 3.0, 5e4, 0.1, 30.0, 0.98, 1e-4),)
     score = Score(30.0, 28.0, 0.95, 0.98)
     return Trained(
-        field, photographs, silhouettes, {"test": score}, history, "finished", 4.0, 0.02, ("<made up>",)
+        field, photographs, silhouettes, {"test": score}, history, "finished", 4.0, 0.02, 0.02, ("<made up>",)
     )
 
 

@@ -6,7 +6,7 @@ from vision.sliding_box import photograph, place
 from vision.tabletop import camera
 
 from dano.vision import Capture, View, with_masks
-from dano.vision.capture._cut import cut_in_two
+from dano.vision.capture.masks._cut import cut_in_two
 
 NOWHERE = np.array([9.0, 9.0, 0.1])
 

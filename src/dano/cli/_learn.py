@@ -341,6 +341,8 @@ def _summary(trained: Trained, made: NeuralObject, output: Path, *, masks_given:
         "bounds": [points.min(0).tolist(), points.max(0).tolist()],
         "masks": "given" if masks_given else "made",
         "unseen": trained.unseen,
+        "unexplained": trained.unexplained,
+        "doubt": trained.field.doubt._asdict(),
         "silhouette_residual": trained.survey.residual,
         "warnings": list(trained.warnings),
     }
@@ -357,6 +359,12 @@ def _print_trained(summary: dict[str, Any], outputs: dict[str, Path], *, with_re
     put(f"centre of mass      {numbers(summary['com'])} m")
     moments = np.linalg.eigvalsh(np.array(summary["inertia"])).tolist()
     put(f"principal inertias  {numbers(moments)} kg m²")
+    doubt = summary["doubt"]
+    put(
+        f"may be off          by {100 * doubt['offset']:.2g} % of its size,"
+        f" {math.degrees(doubt['turn']):.2g}° and {100 * doubt['share']:.2g} % in size"
+    )
+    put(f"not explained       {100 * summary['unexplained']:.2g} % of the silhouettes")
     hull = summary["confidence"]["hull"]
     put(f"the hull differs    by {100 * hull['com']:.2f} % in COM, {100 * hull['inertia']:.1f} % in inertia")
     put()

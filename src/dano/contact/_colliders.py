@@ -7,7 +7,7 @@ from jaxtyping import Array, DTypeLike, Float
 
 from dano.checks import checked_optional
 from dano.fields import AbstractField, GridField
-from dano.maths import checked_array, floating, Numbers, Pose, safe_norm
+from dano.maths import AnyArray, checked_array, floating, Numbers, Pose, safe_norm
 
 # Samples per block. Fewer make the culling finer, more make each pass over a block fatter.
 BLOCK = 16
@@ -64,10 +64,10 @@ class SurfaceSet(eqx.Module):
             the other body; of a "ball" all do, and `points` are directions on the unit ball.
     """
 
-    points: Float[Array, "4 n"]
-    vectors: Float[Array, "3 n"]
-    centers: Float[Array, "blocks 3"]
-    radii: Float[Array, " blocks"]
+    points: Float[AnyArray, "4 n"]
+    vectors: Float[AnyArray, "3 n"]
+    centers: Float[AnyArray, "blocks 3"]
+    radii: Float[AnyArray, " blocks"]
     turning: str = eqx.field(static=True, default="fixed")
 
     @classmethod
@@ -81,8 +81,8 @@ class SurfaceSet(eqx.Module):
     def none(cls, dtype: DTypeLike, blocks: int = 0) -> "SurfaceSet":
         """Blocks of samples without area."""
         n = blocks * BLOCK
-        points, vectors = jnp.zeros((4, n), dtype), jnp.zeros((3, n), dtype)
-        return cls(points, vectors, jnp.zeros((blocks, 3), dtype), jnp.zeros((blocks,), dtype))
+        points, vectors = np.zeros((4, n), dtype), np.zeros((3, n), dtype)
+        return cls(points, vectors, np.zeros((blocks, 3), dtype), np.zeros((blocks,), dtype))
 
 
 class Support(eqx.Module):

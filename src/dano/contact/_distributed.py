@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -18,7 +17,7 @@ from dano.contact._laws import (
     Setting,
     STANDARD_GRAVITY,
 )
-from dano.maths import AnyArray, by_numpy, checked_array, floating, is_traced, library, Numbers, Q
+from dano.maths import AnyArray, by_numpy, checked_array, is_traced, library, Numbers, Q
 
 CHUNK = 16
 """Points that `VariationalEngine.capacity` counts as one."""
@@ -27,9 +26,11 @@ CHUNK = 16
 SINKING = 0.005
 IMPACT_DEPTH = 0.005
 """Depth of an impact over the size of the smaller body, at default."""
-# Where edges and faces of both bodies are known: share by which a body sinks, and least depth of an impact
-# over that of others. A face that closes over a cushion lands row by row: many small impacts lose less.
-_SHARP_SINKING, _SHARP_DEPTH = 1e-4, 2e-3
+# Where edges and faces of both bodies are known: share by which a body sinks, and depth of an impact over
+# that of others. A face that closes over a cushion lands row by row: many small impacts lose less. What an
+# impact leaves deep is pushed out after it. But edges that rest are less deep than one that lands, so that it
+# is the first that has an impact.
+_SHARP_SINKING, _SHARP_DEPTH = 1e-4, 2e-4
 # Velocities within which restitution ends at default: so many times √(g · depth of the heaviest load).
 _SLOW = 0.2
 
@@ -162,36 +163,35 @@ class DistributedLaw(AbstractContactLaw):
 
     def complete(self, params: ContactParams, setting: Setting) -> ContactParams:
         """See `AbstractContactLaw.complete`."""
+        return params.filled(**self.defaults(params, setting))
+
+    def defaults(self, params: ContactParams, setting: Setting) -> dict[str, Any]:
+        """What `complete` fills in; arrays over bodies where `setting` has an array of sizes.
+
+        Args:
+            params: Parameters that are given: a stiffness is not asked for where there is one.
+            setting: What the defaults are derived from.
+        """
         # What is left to the spring needs one.
         sharp = setting.sharp and not self.compliant
-        depth = floating(IMPACT_DEPTH * setting.size)
-        if sharp:
-            depth = _sharp_depth(setting.gravity, setting.timestep, depth)
+        depth = (_SHARP_DEPTH if sharp else 1.0) * IMPACT_DEPTH * setting.size
+        found = {
+            "restitution": 0.0,
+            "restitution_velocity": _slow(setting.gravity, setting.size),
+            "impact_depth": depth,
+            "hysteresis": 0.35,
+            "friction_fading": 0.0,
+            "friction_pressure": 1000.0,
+        }
         if params.stiffness is None:
-            params = params.filled(stiffness=setting.stiffness(_SHARP_SINKING if sharp else SINKING))
-        return params.filled(
-            restitution=0.0,
-            restitution_velocity=_slow(setting.gravity, setting.size),
-            impact_depth=depth,
-            hysteresis=0.35,
-            friction_fading=0.0,
-            friction_pressure=1000.0,
-        )
+            found["stiffness"] = setting.stiffness(_SHARP_SINKING if sharp else SINKING)
+        return found
 
 
 @by_numpy
-def _slow(gravity: Float[Q, ""], size: Any) -> Float[AnyArray, ""]:
+def _slow(gravity: Float[Q, ""], size: Any) -> AnyArray:
     """Speed [m/s] of an impact that counts as slow for bodies of a size [m]."""
     return _SLOW * library(gravity).sqrt(gravity * SINKING * size)
-
-
-@by_numpy
-def _sharp_depth(gravity: Float[Q, ""], timestep: Float[Q, ""], depth: Float[Q, ""]) -> Float[AnyArray, ""]:
-    """Depth of an impact [m] where edges and faces of both bodies are known, from that of others.
-
-    A body that is held is taken to fall until it meets others, within a step by g h²: that is no impact.
-    """
-    return library(gravity).clip(gravity * timestep**2, _SHARP_DEPTH * depth, depth)
 
 
 def combined(a: ContactParams, b: ContactParams) -> ContactParams:
@@ -201,14 +201,15 @@ def combined(a: ContactParams, b: ContactParams) -> ContactParams:
     `restitution_velocity`, `impact_depth` and `friction_pressure` the smaller.
     """
 
-    def of(name: str) -> Array:
+    def of(name: str) -> AnyArray:
         x, y = getattr(a, name), getattr(b, name)
+        xp = library(x, y)
         if name == "sliding_friction":
             product = x * y
             slips = product > 0
-            return jnp.where(slips, jnp.sqrt(jnp.where(slips, product, 1)), 0)
+            return xp.where(slips, xp.sqrt(xp.where(slips, product, 1)), 0)
         smaller = name in ("restitution_velocity", "impact_depth", "friction_pressure")
-        return (jnp.minimum if smaller else jnp.maximum)(x, y)
+        return (xp.minimum if smaller else xp.maximum)(x, y)
 
     names = [name for name in a.__dataclass_fields__ if getattr(a, name) is not None]
     return eqx.tree_at(lambda p: [getattr(p, name) for name in names], a, [of(name) for name in names])
@@ -216,8 +217,8 @@ def combined(a: ContactParams, b: ContactParams) -> ContactParams:
 
 def materials(
     groups: Sequence[tuple[DistributedLaw, ContactParams]],
-    timestep: Float[Array, ""],
-    gravity: Float[Array, ""],
+    timestep: Float[AnyArray, ""],
+    gravity: Float[AnyArray, ""],
 ) -> Material:
     """What points of contacts feel, as arrays over all contacts.
 
@@ -227,17 +228,18 @@ def materials(
         gravity: Its magnitude [m/s²].
     """
     sizes = [params.sliding_friction.size for _, params in groups]
+    xp = library(timestep, gravity, *jax.tree.leaves(groups))
 
-    def column(values: Sequence[Array]) -> Float[Array, " n"]:
-        every = [jnp.broadcast_to(x, (n,)) for x, n in zip(values, sizes, strict=True)]
-        return jnp.concatenate(every).astype(timestep.dtype)
+    def column(values: Sequence[AnyArray]) -> Float[AnyArray, " n"]:
+        every = [xp.broadcast_to(x, (n,)) for x, n in zip(values, sizes, strict=True)]
+        return xp.concatenate(every).astype(timestep.dtype)
 
     stacked: ContactParams = jax.tree.map(lambda *x: column(x), *(params for _, params in groups))
     laws = [law for law, _ in groups]
     n = sum(sizes)
-    strength = jnp.where(gravity > 0, gravity, STANDARD_GRAVITY)
+    strength = xp.where(gravity > 0, gravity, STANDARD_GRAVITY)
     # Sinking from rest by half the depth of an impact makes no impact.
-    settling = jnp.where(gravity > 0, jnp.sqrt(strength * stacked.impact_depth), 0)
+    settling = xp.where(gravity > 0, xp.sqrt(strength * stacked.impact_depth), 0)
     return Material(
         stacked.stiffness,
         stacked.restitution,
@@ -248,9 +250,9 @@ def materials(
         stacked.friction_pressure,
         column([law.stiction_velocity for law in laws]),
         column([law.implicitness for law in laws]) * timestep,
-        jnp.broadcast_to(timestep, (n,)),
-        jnp.asarray(np.repeat([0.0 if law.compliant else 1.0 for law in laws], sizes), timestep.dtype),
-        jnp.maximum(stacked.restitution_velocity + gravity * timestep, settling),
-        jnp.broadcast_to(_SLOW**2 * strength, (n,)).astype(timestep.dtype),
+        xp.broadcast_to(timestep, (n,)),
+        np.repeat([0.0 if law.compliant else 1.0 for law in laws], sizes).astype(timestep.dtype),
+        xp.maximum(stacked.restitution_velocity + gravity * timestep, settling),
+        xp.broadcast_to(_SLOW**2 * strength, (n,)).astype(timestep.dtype),
         column([law.gradual_stiction for law in laws]),
     )

@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.maths import checked_floating, is_traced, Numbers
+from dano.maths import AnyArray, checked_floating, is_traced, Numbers
 from dano.names import did_you_mean
 
 # A scalar, or None until a scene fills it in; written so that type checkers let users read it from a scene.
@@ -152,7 +152,8 @@ class Setting(NamedTuple):
     """What default parameters are derived from.
 
     Attributes:
-        size: Largest extent of the smaller body [m].
+        size: Largest extent of the smaller body [m]; an array of those of many bodies that are completed
+            at once.
         gravity: Its magnitude, 9.81 where there is none [m/s²].
         stiffness: Gives the stiffness [Pa/m] at which either body, set down on a rigid floor in a typical
             orientation, sinks by at most a share of its size.
@@ -160,9 +161,9 @@ class Setting(NamedTuple):
         sharp: Whether edges and faces of both bodies are known exactly.
     """
 
-    size: float
+    size: float | Float[np.ndarray, " n"]
     gravity: Float[Array, ""]
-    stiffness: Callable[[float], Float[Array, ""]]
+    stiffness: Callable[[float], AnyArray]
     timestep: Float[Array, ""]
     sharp: bool
 

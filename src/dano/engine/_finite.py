@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
 
 from dano.contact import PARAMETER_RANGES
 from dano.engine._compiling import by_numpy_on_cpus
@@ -28,22 +27,23 @@ class _Numbers(NamedTuple):
     """Numbers of a scene with one range."""
 
     what: str  # What they are, for messages
-    values: list[Array]  # The numbers
+    values: list[AnyArray]  # The numbers
     least: float = -_LARGEST  # They are not smaller, or, where it is zero and `divides`, larger
     most: float = _LARGEST  # They are not larger
     divides: bool = False  # Whether zero is out of range
 
 
-def sound(scene: Scene) -> Bool[Array, ""]:
+def sound(scene: Scene) -> Bool[AnyArray, ""]:
     """Whether every number of a scene is finite, and in the range that `Scene.create` asks for."""
-    held = [jnp.all(_holds(each)) for each in _numbers(scene)]
-    return jnp.all(jnp.stack(held))
+    held = [_holds(each).all() for each in _numbers(scene)]
+    xp = library(*held)
+    return xp.all(xp.stack(held))
 
 
 def unsound(scene: Scene) -> str | None:
     """What is not finite, or out of its range; None where nothing is, or where values are traced."""
     for each in _numbers(scene):
-        if not is_traced(each.values) and not bool(jnp.all(_holds(each))):
+        if not is_traced(each.values) and not bool(_holds(each).all()):
             values = np.concatenate([np.ravel(x) for x in each.values])
             bad = values[~np.asarray(_holds(each))]
             return f"{each.what} must be finite{_range(each)}, got {bad[0]:.4g}"
@@ -56,9 +56,9 @@ def _range(each: _Numbers) -> str:
     return " and > 0" if each.divides else " and in [0, 1]" if each.most == 1 else " and ≥ 0"
 
 
-def _holds(each: _Numbers) -> Bool[Array, " n"]:
+def _holds(each: _Numbers) -> Bool[AnyArray, " n"]:
     # Comparisons with NaN are false.
-    values = jnp.concatenate([jnp.ravel(x) for x in each.values])
+    values = library(*each.values).concatenate([x.reshape(-1) for x in each.values])
     large_enough = values > each.least if each.divides else values >= each.least
     return large_enough & (values <= each.most)
 
@@ -71,7 +71,7 @@ def _numbers(scene: Scene) -> Iterator[_Numbers]:
     if moving:
         masses = [x for body in moving for x in (body.mass, body.mass_scale)]
         yield _Numbers("mass and mass_scale of bodies", masses, least=0.0, divides=True)
-        diagonal = [jnp.diagonal(body.inertia) for body in moving]
+        diagonal = [body.inertia.diagonal() for body in moving]
         yield _Numbers("principal inertia of bodies", diagonal, least=0.0, divides=True)
         yield _Numbers("inertia of bodies", [body.inertia for body in moving])
     places = [x for body in scene.bodies for x in (body.com, body.com_offset)]
@@ -84,7 +84,7 @@ def _numbers(scene: Scene) -> Iterator[_Numbers]:
     yield from _of_joints(scene)
 
 
-def _sizes(shape: AbstractShape) -> list[Array]:
+def _sizes(shape: AbstractShape) -> list[AnyArray]:
     """Lengths that a shape is made from."""
     while isinstance(shape, PosedShape):
         shape = shape.shape

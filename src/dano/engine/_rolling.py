@@ -5,6 +5,7 @@ number of steps. A policy is compiled with a step, in a program that makes as ma
 inside of `jax.jit`, and for derivatives by a policy, a number of steps is part of a program.
 """
 
+import weakref
 from typing import Any
 
 import equinox as eqx
@@ -21,6 +22,9 @@ from dano.scene import Control, Scene, State
 
 # Steps that a program makes at most before it is asked again.
 _ROWS = 256
+# What the steps of scenes share, of those that were simulated last and are still there, by scene and engine.
+_KEPT: dict[tuple[int, Any], tuple["weakref.ref[Scene]", Any]] = {}
+_MOST = 8
 
 
 def rolled(
@@ -54,8 +58,22 @@ def _of_jax(tree: Any) -> Any:
     return jax.tree.map(lambda x: on_device(x) if isinstance(x, np.ndarray) else x, tree)
 
 
-@compiled
 def _prepared(engine: Any, scene: Scene) -> Any:
+    if not engine.prepares_by_numpy(scene):
+        return _jitted_prepared(engine, scene)
+    key = id(scene), engine
+    found = _KEPT.get(key)
+    if found is not None and found[0]() is scene:
+        return found[1]
+    prepared = engine.prepare(scene)
+    while len(_KEPT) >= _MOST:
+        _KEPT.pop(next(iter(_KEPT), None), None)
+    _KEPT[key] = weakref.ref(scene, lambda _: _KEPT.pop(key, None)), prepared
+    return prepared
+
+
+@compiled
+def _jitted_prepared(engine: Any, scene: Scene) -> Any:
     return engine.prepare(scene)
 
 

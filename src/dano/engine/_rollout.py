@@ -38,6 +38,10 @@ class AbstractEngine(eqx.Module):
         """What the steps of a scene share, computed once a rollout; passed to `step`."""
         return None
 
+    def prepares_by_numpy(self, scene: Scene) -> bool:
+        """Whether `prepare` computes by NumPy, and is called outside of a program."""
+        return False
+
     @abc.abstractmethod
     def step(
         self, scene: Scene, prepared: Any, state: State, control: Control | None
@@ -101,6 +105,10 @@ class VariationalEngine(AbstractEngine):
     def prepare(self, scene: Scene) -> _variational.Prepared:
         """See `AbstractEngine.prepare`."""
         return _variational.prepare(scene, self.capacity)
+
+    def prepares_by_numpy(self, scene: Scene) -> bool:
+        """See `AbstractEngine.prepares_by_numpy`."""
+        return _variational.is_by_numpy(scene)
 
     def enlarged(self, scene: Scene, factor: int) -> "VariationalEngine | None":
         """See `AbstractEngine.enlarged`."""

@@ -22,7 +22,7 @@ def runs_on(scene: Scene) -> str:
     parts = []
     if scene.contacts or scene.others is not None:
         own = f" with {built['LAW']}" if built.get("LAW") else ""
-        laws = {"points" + own: bool(scene.point_pairs), "patches": built["PATCHES"]}
+        laws = {"points" + own: len(scene.point_pairs) > 0, "patches": built["PATCHES"]}
         names = {number: name.lower().replace("_", " ") for name, number in kind_numbers().items()}
         solids = ", ".join(sorted(names[kind] for kind in built["KINDS"] if kind in names))
         parts.append(f"contact of {' and '.join(law for law, used in laws.items() if used)} on {solids}")

@@ -7,12 +7,14 @@ theorem, are kernels (`dano.engine.kernels`, docs/theory/step.md); here a scene 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
 
 from dano.contact import AbstractPatchLaw, CHUNK, DistributedLaw
+from dano.engine._compiling import are_on_cpus
 from dano.engine._finite import marked, sound
 from dano.engine._reports import Report, SolverOptions
 from dano.engine.launching import rollout as launched, scene_tables, Tables
+from dano.maths import AnyArray, by_numpy, is_traced
 from dano.scene import Control, lifted, Scene, State
 
 
@@ -20,8 +22,20 @@ class Prepared(eqx.Module):
     """What does not change from step to step: see `prepare`."""
 
     tables: Tables  # Of the scene
-    sound: Bool[Array, ""]  # Whether the numbers of the scene are in their ranges, see `dano.engine._finite`
+    sound: Bool[
+        AnyArray, ""
+    ]  # Whether the numbers of the scene are in their ranges, see `dano.engine._finite`
     capacity: int = eqx.field(static=True)  # Chunks of points that a step has room for (static)
+
+
+def is_by_numpy(scene: Scene) -> bool:
+    """Whether `prepare` computes the tables of a scene by NumPy: where nothing is traced, or on a GPU.
+
+    Then no program depends on how many bodies there are. Contacts with a patch law are left to JAX.
+    """
+    arrays = jax.tree.leaves(scene)
+    known = not is_traced(arrays) and are_on_cpus(arrays)
+    return known and all(contact.law.presses for contact in scene.contacts)
 
 
 def prepare(scene: Scene, capacity: int | None) -> Prepared:
@@ -35,7 +49,11 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
         ValueError: If the scene has a law or a shape that kernels do not know.
     """
     _check_laws(scene)
-    if not scene.point_pairs:
+    return _by_numpy(scene, capacity) if is_by_numpy(scene) else _tables(scene, capacity)
+
+
+def _tables(scene: Scene, capacity: int | None) -> Prepared:
+    if not len(scene.point_pairs):
         return Prepared(scene_tables(scene), sound(scene), 0)
     if capacity is None:
         capacity = scene.room
@@ -44,6 +62,9 @@ def prepare(scene: Scene, capacity: int | None) -> Prepared:
         sampled = [body.surface.points.shape[1] for body in scene.bodies if body.surface is not None]
         capacity = -(-sum(sampled) // CHUNK)
     return Prepared(scene_tables(scene), sound(scene), capacity)
+
+
+_by_numpy = by_numpy(_tables)
 
 
 def _check_laws(scene: Scene) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._shapes import AbstractCentred, checked_edge, column, positive, SolidMoments
 from dano.hosted import hosted
-from dano.maths import column_norm, Numbers
+from dano.maths import AnyArray, column_norm, Numbers
 
 
 class Ellipsoid(AbstractCentred):
@@ -55,7 +55,7 @@ class Ellipsoid(AbstractCentred):
         """Gradient of the quadratic form, x / a² [1/m]."""
         return x / self.semi_axes.astype(x.dtype) ** 2
 
-    def leaf(self) -> dict[str, Array]:
+    def leaf(self) -> dict[str, AnyArray]:
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": self.semi_axes}
 

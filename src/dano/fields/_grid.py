@@ -10,7 +10,17 @@ from jaxtyping import Array, Float
 from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._spline import border, degree_of, multi_indices, nonnegative_coefficients, spline_jet
 from dano.hosted import hosted
-from dano.maths import checked_array, checked_floating, is_traced, library, Numbers, on_device, product, Q
+from dano.maths import (
+    AnyArray,
+    checked_array,
+    checked_floating,
+    is_traced,
+    library,
+    Numbers,
+    on_device,
+    product,
+    Q,
+)
 
 
 class DensityMoments(NamedTuple):
@@ -111,7 +121,7 @@ class GridField(AbstractField):
         nx, ny, nz = (size - 2 * self._border for size in self.coefficients.shape)
         return nx, ny, nz
 
-    def leaf(self) -> dict[str, Array]:
+    def leaf(self) -> dict[str, AnyArray]:
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": self.origin, "spacing": self.spacing}
 

@@ -18,7 +18,16 @@ from dano.fields._shapes import (
     SolidMoments,
 )
 from dano.hosted import hosted
-from dano.maths import checked_array, column_norm, is_traced, Numbers, product, safe_normalize
+from dano.maths import (
+    AnyArray,
+    checked_array,
+    column_norm,
+    is_traced,
+    library,
+    Numbers,
+    product,
+    safe_normalize,
+)
 
 
 class HalfSpace(AbstractPrimitive):
@@ -69,7 +78,7 @@ class HalfSpace(AbstractPrimitive):
         """The plane's unit normal."""
         return self.normal_direction.astype(x.dtype)
 
-    def leaf(self) -> dict[str, Array]:
+    def leaf(self) -> dict[str, AnyArray]:
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": self.normal_direction, "length": self.offset}
 
@@ -111,9 +120,9 @@ class Sphere(AbstractCentred):
         """The position itself: points far from the centre weigh more."""
         return x
 
-    def leaf(self) -> dict[str, Array]:
+    def leaf(self) -> dict[str, AnyArray]:
         """See `AbstractPrimitive.leaf`."""
-        return {"sizes": jnp.stack([self.radius, 0 * self.radius, 0 * self.radius])}
+        return {"sizes": _row(self.radius, 0 * self.radius, 0 * self.radius)}
 
     @hosted
     def solid_moments(self) -> SolidMoments:
@@ -176,7 +185,7 @@ class Box(AbstractCentred):
         )
         return length + jnp.where(largest <= 0, largest, 0) - self.rounding.astype(x.dtype), gradient
 
-    def leaf(self) -> dict[str, Array]:
+    def leaf(self) -> dict[str, AnyArray]:
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": self.half_extents, "length": self.rounding}
 
@@ -242,9 +251,9 @@ class Capsule(AbstractCentred):
         half_length = self.half_length.astype(x.dtype)
         return jnp.stack([x[0], x[1], x[2] - jnp.clip(x[2], -half_length, half_length)])
 
-    def leaf(self) -> dict[str, Array]:
+    def leaf(self) -> dict[str, AnyArray]:
         """See `AbstractPrimitive.leaf`."""
-        return {"sizes": jnp.stack([self.radius, self.half_length, 0 * self.radius])}
+        return {"sizes": _row(self.radius, self.half_length, 0 * self.radius)}
 
     @hosted
     def solid_moments(self) -> SolidMoments:
@@ -290,9 +299,9 @@ class Cylinder(AbstractCentred):
         along = jnp.abs(x[2]) - self.half_length.astype(x.dtype)
         return corner_distance(jnp.stack([across, along]))
 
-    def leaf(self) -> dict[str, Array]:
+    def leaf(self) -> dict[str, AnyArray]:
         """See `AbstractPrimitive.leaf`."""
-        return {"sizes": jnp.stack([self.radius, self.half_length, 0 * self.radius])}
+        return {"sizes": _row(self.radius, self.half_length, 0 * self.radius)}
 
     @hosted
     def solid_moments(self) -> SolidMoments:
@@ -301,6 +310,10 @@ class Cylinder(AbstractCentred):
         volume = 2 * math.pi * r**2 * h
         across = volume * r**2 / 4
         return self._moments(volume, jnp.stack([across, across, volume * h**2 / 3]))
+
+
+def _row(*numbers: AnyArray) -> Float[AnyArray, "3"]:
+    return library(*numbers).stack(numbers)
 
 
 PRIMITIVES: dict[str, type[AbstractPrimitive]] = {

@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
 from dano.hosted import hosted
-from dano.maths import checked_array, column_norm, is_traced, library, Numbers, Q
+from dano.maths import AnyArray, checked_array, column_norm, is_traced, library, Numbers, Q
 
 DEFAULT_EDGE = 0.005
 """Edge width of a shape that states none, as a fraction of its size.
@@ -196,7 +196,7 @@ class AbstractPrimitive(AbstractShape):
     """What it is made from, besides `edge`, with the count of numbers of each."""
 
     @abc.abstractmethod
-    def leaf(self) -> dict[str, Array]:
+    def leaf(self) -> dict[str, AnyArray]:
         """What a leaf holds besides its pose: `sizes`, `length`; see `dano.physics.solids.leaves.Leaf`."""
 
     @abc.abstractmethod

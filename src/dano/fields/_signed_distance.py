@@ -13,7 +13,7 @@ from dano.fields._redistance import spread_distances
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._spline import border, degree_of, interpolating_coefficients, node_values, spline_jet
 from dano.hosted import hosted
-from dano.maths import checked_array, checked_floating, column_norm, is_traced, library, Numbers, Q
+from dano.maths import AnyArray, checked_array, checked_floating, column_norm, is_traced, library, Numbers, Q
 
 _EXTENSION = 16
 """Nodes added by odd reflection, which continues a slope, to keep the spline filter's ends away."""
@@ -91,7 +91,7 @@ class SignedDistanceGrid(AbstractShape):
         """Signed distances [m] at the nodes."""
         return node_values(self.coefficients, degree_of(self.interpolation))
 
-    def leaf(self) -> dict[str, Array]:
+    def leaf(self) -> dict[str, AnyArray]:
         """See `AbstractPrimitive.leaf`."""
         return {"sizes": self.origin, "spacing": self.spacing}
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dano.mujoco._settings import is_gap_beyond, Settings
 from dano.mujoco._solids import Geom, object_solid, Solid
@@ -34,6 +34,8 @@ _TOLD = 6
 """Numbers of `dano.mujoco.kernels.tables.Options`."""
 _LANES = 64
 """Threads of a block on a GPU: each needs many registers."""
+_NONE = 1e30
+"""Area of a sample where there are none [m²]."""
 _FLAT = 10.0
 """A shape with this radius of curvature, in distances between samples, is as a plane to an object's: they
 miss no more than 1/80 of that distance of its depth. Its own samples, which are few, are not asked then.
@@ -144,6 +146,13 @@ def _arrays(
     if sampled:
         samples["point"] = np.concatenate([each.points for each in sampled])
         samples["area"] = np.concatenate([each.vectors for each in sampled])
+    faces = [face for part in parts if part.thing is not None for face in part.thing.faces.faces]
+    flat = like.rows("known.faces", len(faces))
+    if faces:
+        counts = [len(face.edges) for face in faces]
+        flat["plane"], flat["count"] = np.array([face.plane for face in faces]), counts
+        flat["first"] = np.cumsum([0, *counts[:-1]])
+    on_faces = [_on_faces(part) for part in parts if part.surface is not None]
     touching = like.rows("known.pairs", len(pairs))
     touching["first"], touching["second"] = pairs.T
     touching["both"] = [not _is_flat(parts[a], parts[b]) for a, b in pairs]
@@ -152,13 +161,34 @@ def _arrays(
         "balls": [np.zeros((0, 4)), *(each.balls for each in sampled)],
         "runs": [np.zeros((0, 4)), *(each.runs for each in sampled)],
         "planes": [np.zeros((0, 4)), *planes],
+        "edges": [np.zeros((0, 4)), *(face.edges for face in faces)],
+        "facing": [np.zeros((0, 3)), *(facing for facing, _ in on_faces)],
+        "rim": [np.zeros(0), *(rim for _, rim in on_faces)],
         "sizes": [np.asarray(sizes)],
     }
-    found = {"parts": numbers, "index": index, "pairs": touching, "samples": samples}
+    found = {"parts": numbers, "index": index, "pairs": touching, "samples": samples, "faces": flat}
     for name, values in plain.items():
         base = like.layout.arrays[f"known.{name}"].dtype.base
         found[name] = np.ascontiguousarray(np.concatenate(values), base)
     return {**{f"known.{name}": values for name, values in found.items()}, **solids}
+
+
+def _on_faces(part: Part) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Normals of the faces that samples lie within, and which lie on edges: see `Faces.around`."""
+    assert part.surface is not None
+    n = len(part.surface.points)
+    if part.thing is None:
+        return np.zeros((n, 3)), np.zeros(n, bool)
+    return part.thing.faces.around(part.surface.points, part.surface.vectors)
+
+
+def _grain(part: Part) -> float:
+    """Area of a sample [m²], of those that turn the finest; endless where there are none that are asked."""
+    if part.surface is None:
+        return _NONE
+    areas = np.linalg.norm(part.surface.vectors * np.prod(part.scale) / part.scale, axis=1)
+    areas = areas[areas > 0]
+    return float(np.median(areas) if part.surface.turning == 0 else areas.min())
 
 
 def _count(part: Part) -> int:
@@ -221,16 +251,20 @@ def _solids(like: Parameters, parts: Sequence[Part]) -> tuple[dict[str, np.ndarr
 
 def _parts(like: Parameters, parts: Sequence[Part], at: Sequence[int]):
     numbers, index = like.rows("known.parts", len(parts)), like.rows("known.index", len(parts))
-    block, run = 0, 0
+    block, run, face = 0, 0, 0
     for row, whole, part, place in zip(numbers, index, parts, at, strict=True):
         thing = part.thing
         row["scale"], row["thickness"] = part.scale, part.solid.thickness
+        whole["first_face"], whole["faces"], row["grain"] = face, 0, _grain(part)
         whole["body"], whole["geom"], whole["is_object"] = part.body, part.geom, thing is not None
         whole["solid"], whole["at"] = _number(part.solid.kind), place
         whole["count"] = 0 if part.solid.planes is None else len(part.solid.planes)
         if thing is not None:
             row["middle"], row["radius"], row["thickness"] = thing.middle, thing.radius, thing.thickness
             whole["contype"], whole["conaffinity"] = thing.bits
+            row["band"], row["slack"] = thing.faces.band(thing.thickness), thing.faces.slack
+            whole["faces"] = len(thing.faces.faces)
+            face += len(thing.faces.faces)
         whole["first_block"], whole["blocks"] = block, _count(part) // _BLOCK
         whole["turning"] = 0 if part.surface is None else part.surface.turning
         whole["first_run"] = run

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.maths import checked_array, Numbers, quat_to_matrix
+from dano.mujoco._faces import Faces, faces_of
 from dano.mujoco._surfaces import Surface, surface_of
 from dano.objects import NeuralObject
 from dano.scene_file import load_object
@@ -18,6 +19,7 @@ class Thing:
 
     obj: NeuralObject  # The object
     surface: Surface  # Its samples, in the body frame
+    faces: Faces  # Its flat faces, in the body frame
     middle: Float[np.ndarray, "3"]  # Centre of a ball around all samples [m]
     radius: float  # Of that ball [m]
     size: float  # Largest extent [m]
@@ -70,6 +72,7 @@ def thing_of(
     return Thing(
         obj=obj,
         surface=surface,
+        faces=faces_of(obj).moved(rotation, position),
         middle=middle,
         radius=float(np.linalg.norm(surface.points - middle, axis=1).max()),
         size=float((upper - lower).max()),

@@ -4,13 +4,13 @@ See `dano.physics.solids.distances` and `dano.physics.overlap`.
 """
 
 import functools
+import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, DTypeLike, Float, Int
+from jaxtyping import DTypeLike, Float, Int
 
 from dano.fields import (
     AbstractField,
@@ -26,7 +26,7 @@ from dano.fields import (
     UnionField,
     UnionShape,
 )
-from dano.maths import matmul, matvec, Pose
+from dano.maths import AnyArray, library, matmul, matvec, Pose
 from dano.physics.solids import kinds as numbers_of_kinds
 
 LEAF_WIDTH = 20
@@ -59,15 +59,14 @@ class Placed(NamedTuple):
     """A field in a frame: x = s R y + p for y in its own."""
 
     field: AbstractField
-    factor: Float[Array, ""]
-    position: Float[Array, "3"]
-    rotation: Float[Array, "3 3"]
+    factor: Float[AnyArray, ""]
+    position: Float[AnyArray, "3"]
+    rotation: Float[AnyArray, "3 3"]
 
     @classmethod
     def still(cls, field: AbstractField, dtype: DTypeLike) -> "Placed":
         """A field in its own frame."""
-        still = (np.ones((), dtype), np.zeros(3, dtype), np.eye(3, dtype=dtype))
-        return cls(field, *map(jax.device_put, still))
+        return cls(field, np.ones((), dtype), np.zeros(3, dtype), np.eye(3, dtype=dtype))
 
     @property
     def leaf(self) -> Known:
@@ -75,7 +74,9 @@ class Placed(NamedTuple):
         assert isinstance(self.field, Known)
         return self.field
 
-    def inside(self, field: AbstractField, pose: Pose | None = None, factor: Array | None = None) -> "Placed":
+    def inside(
+        self, field: AbstractField, pose: Pose | None = None, factor: AnyArray | None = None
+    ) -> "Placed":
         """What the field is made of."""
         dtype, position, rotation, size = self.factor.dtype, self.position, self.rotation, self.factor
         if factor is not None:
@@ -96,10 +97,10 @@ class Leaves(NamedTuple):
         bounds: Lower bounds on splines, see `lower_bounds`, one below the other.
     """
 
-    rows: Float[Array, "leaves 20"]
+    rows: Float[AnyArray, "leaves 20"]
     kinds: Int[np.ndarray, "leaves 7"]
-    coefficients: Float[Array, "coefficients 1"]
-    bounds: Float[Array, "bounds 1"]
+    coefficients: Float[AnyArray, "coefficients 1"]
+    bounds: Float[AnyArray, "bounds 1"]
 
 
 def is_known(field: AbstractField) -> bool:
@@ -149,17 +150,17 @@ def kinds_of(leaves: Sequence[Placed]) -> set[int]:
 def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
     """Rows of leaves."""
     if not leaves:
-        none = jnp.zeros((0, 1), dtype)
-        return Leaves(jnp.zeros((0, LEAF_WIDTH), dtype), _whole([]), none, none)
-    zero = {"sizes": jnp.zeros(3), "length": jnp.zeros(()), "spacing": jnp.ones(3)}
+        none = np.zeros((0, 1), dtype)
+        return Leaves(np.zeros((0, LEAF_WIDTH), dtype), _whole([]), none, none)
+    zero = {"sizes": np.zeros(3), "length": np.zeros(()), "spacing": np.ones(3)}
     own = [{**zero, **each.leaf.leaf()} for each in leaves]
     columns = [
-        jnp.stack([leaf.factor for leaf in leaves]),
-        jnp.stack([leaf.position for leaf in leaves]),
-        jnp.stack([leaf.rotation for leaf in leaves]),
-        *(jnp.stack([numbers[name].astype(dtype) for numbers in own]) for name in zero),
+        _stacked([leaf.factor for leaf in leaves]),
+        _stacked([leaf.position for leaf in leaves]),
+        _stacked([leaf.rotation for leaf in leaves]),
+        *(_stacked([numbers[name].astype(dtype) for numbers in own]) for name in zero),
     ]
-    kinds, coefficients, bounds, at, first_bound = [], [jnp.zeros(0, dtype)], [jnp.zeros(0, dtype)], 0, 0
+    kinds, coefficients, bounds, at, first_bound = [], [np.zeros(0, dtype)], [np.zeros(0, dtype)], 0, 0
     for leaf in leaves:
         kind = (kind_number(leaf.leaf.kind), 0, 0, 0, 0, 0, 0)
         if isinstance(leaf.field, SignedDistanceGrid | GridField):
@@ -173,14 +174,18 @@ def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
                 first_bound += bounds[-1].shape[0]
         kinds.append(kind)
     return Leaves(
-        jnp.concatenate([x.reshape(len(leaves), -1) for x in columns], axis=1),
+        library(*columns).concatenate([x.reshape(len(leaves), -1) for x in columns], axis=1),
         _whole(kinds),
-        jnp.concatenate(coefficients)[:, None],
-        jnp.concatenate(bounds)[:, None],
+        library(*coefficients).concatenate(coefficients)[:, None],
+        library(*bounds).concatenate(bounds)[:, None],
     )
 
 
-def lower_bounds(coefficients: Float[Array | np.ndarray, "x y z"], degree: int) -> Float[Array, "a b c"]:
+def _stacked(rows: Sequence[AnyArray]) -> AnyArray:
+    return library(*rows).stack(rows)
+
+
+def lower_bounds(coefficients: Float[AnyArray, "x y z"], degree: int) -> Float[AnyArray, "a b c"]:
     """Lower bounds on a spline between its outermost nodes, one for each block of cells.
 
     A spline is a mean of the coefficients around a place.
@@ -189,13 +194,14 @@ def lower_bounds(coefficients: Float[Array | np.ndarray, "x y z"], degree: int) 
         coefficients: Of the spline, its border of `degree` + 1 nodes included.
         degree: Of the spline.
     """
-    bound = jax.lax.stop_gradient(jnp.asarray(coefficients))
+    xp = library(coefficients)
+    bound = coefficients if xp is np else jax.lax.stop_gradient(coefficients)
     cell = numbers_of_kinds.CELL
     for axis, size in enumerate(coefficients.shape):
         n = (size - 2 * degree - 3) // cell + 1
         # From one before the own node of a block's first cell to two beyond that of its last.
         nodes = np.minimum(degree + np.arange(cell + 3)[:, None] + cell * np.arange(n), size - 1)
-        bound = functools.reduce(jnp.minimum, (jnp.take(bound, each, axis) for each in nodes))
+        bound = functools.reduce(xp.minimum, (xp.take(bound, each, axis) for each in nodes))
     return bound
 
 
@@ -203,7 +209,7 @@ def _whole(kinds: Sequence[tuple[int, ...]]) -> Int[np.ndarray, "leaves 7"]:
     return np.array(kinds, np.int32).reshape(-1, _KIND_WIDTH)
 
 
-def balls_around_runs(balls: Float[Array, "b 4"]) -> Float[Array, "b 4"]:
+def balls_around_runs(balls: Float[AnyArray, "b 4"]) -> Float[AnyArray, "b 4"]:
     """Balls around each block and those after it; a run may include blocks of the next body.
 
     Args:
@@ -214,14 +220,20 @@ def balls_around_runs(balls: Float[Array, "b 4"]) -> Float[Array, "b 4"]:
         return balls
     members = np.minimum(np.arange(n)[:, None] + np.arange(_RUN)[None], n - 1)
     centers, radii = balls[members, :3], balls[members, 3]
-    middle = jnp.mean(centers, axis=1)
-    reach = jnp.sqrt(jnp.sum((centers - middle[:, None]) ** 2, axis=2)) + radii
-    return jnp.concatenate([middle, jnp.max(reach, axis=1, keepdims=True)], axis=1)
+    xp = library(balls)
+    middle = _summed(centers, 1) / _RUN
+    reach = xp.sqrt(_summed((centers - middle[:, None]) ** 2, 2)) + radii
+    return xp.concatenate([middle, xp.max(reach, axis=1, keepdims=True)], axis=1)
+
+
+def _summed(x: AnyArray, axis: int) -> AnyArray:
+    """Sum over a short axis, in one order by NumPy and JAX."""
+    return functools.reduce(operator.add, (x.take(i, axis) for i in range(x.shape[axis])))
 
 
 def slabs_of_blocks(
-    points: Float[Array, "n 3"], vectors: Float[Array, "n 3"], centers: Float[Array, "b 3"]
-) -> Float[Array, "b 4"]:
+    points: Float[AnyArray, "n 3"], vectors: Float[AnyArray, "n 3"], centers: Float[AnyArray, "b 3"]
+) -> Float[AnyArray, "b 4"]:
     """Slabs around blocks of samples: unit normals, and how far samples are along them from a centre at most.
 
     Args:
@@ -231,9 +243,11 @@ def slabs_of_blocks(
     """
     b = centers.shape[0]
     if b == 0:
-        return jnp.zeros((0, 4), points.dtype)
-    whole = jnp.sum(vectors.reshape(b, -1, 3), axis=1)
-    size = jnp.sqrt(jnp.sum(whole**2, axis=1, keepdims=True))
-    normals = jnp.where(size > 0, whole / jnp.where(size > 0, size, 1), 0)
-    along = jnp.sum((points.reshape(b, -1, 3) - centers[:, None]) * normals[:, None], axis=2)
-    return jnp.concatenate([normals, jnp.max(jnp.abs(along), axis=1, keepdims=True)], axis=1)
+        return np.zeros((0, 4), points.dtype)
+    xp = library(points, vectors, centers)
+    whole = _summed(vectors.reshape(b, -1, 3), 1)
+    size = xp.sqrt(_summed(whole**2, 1))[:, None]
+    # A factor: by many at once, XLA divides so, too.
+    normals = whole * xp.where(size > 0, 1 / xp.where(size > 0, size, 1), 0)
+    along = _summed((points.reshape(b, -1, 3) - centers[:, None]) * normals[:, None], 2)
+    return xp.concatenate([normals, xp.max(xp.abs(along), axis=1, keepdims=True)], axis=1)

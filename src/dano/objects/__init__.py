@@ -1,5 +1,6 @@
 """Neural objects: mass properties, contact samples, and the object that carries both."""
 
+from dano.objects._flats import flat_faces as flat_faces, FlatFace as FlatFace
 from dano.objects._interior import (
     fill_hollows as fill_hollows,
     Interior as Interior,

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
 
 from dano.maths import floating
 from dano.objects._surface import SurfaceSamples
@@ -63,21 +64,50 @@ def flattened(surface: SurfaceSamples, spacing: ArrayLike) -> SurfaceSamples:
     return SurfaceSamples(floating(moved), surface.normals, surface.areas, surface.vectors)
 
 
-def flat_share(surface: SurfaceSamples, spacing: ArrayLike) -> float:
-    """Share of the area of a surface whose samples lie on planes, as `flattened` leaves them."""
+class FlatFace(NamedTuple):
+    """A flat region of a surface.
+
+    Attributes:
+        normal: Unit outward normal [F].
+        offset: Where the plane is: n · x = offset [m, F].
+        members: Samples that lie on the plane, those of its rim included, shape (n,).
+    """
+
+    normal: Float[np.ndarray, "3"]
+    offset: float
+    members: Bool[np.ndarray, " n"]
+
+
+def flat_faces(surface: SurfaceSamples, spacing: ArrayLike) -> list[FlatFace]:
+    """The flat regions of a surface, as `flattened` leaves them, the largest first.
+
+    Args:
+        surface: The samples.
+        spacing: Of the grid [m], shape (3,).
+    """
     points, normals, areas = (
         np.asarray(x, dtype=np.float64) for x in (surface.points, surface.normals, surface.areas)
     )
     cell = float(np.max(np.asarray(spacing)))
-    left, flat = np.ones(len(points), dtype=bool), 0.0
+    left = np.ones(len(points), dtype=bool)
+    faces = []
     for _ in range(_PLANES):
         plane, region = _largest(points, normals, areas * left, cell)
         if plane is None:
             break
-        exact = left & (np.abs(points @ plane.normal - plane.offset) < _EXACT * cell)
-        flat += areas[exact].sum()
+        exact = np.abs(points @ plane.normal - plane.offset) < _EXACT * cell
+        faces.append(FlatFace(plane.normal, plane.offset, exact))
         left &= ~(exact | region)
-    return float(flat / areas.sum())
+    return faces
+
+
+def flat_share(surface: SurfaceSamples, spacing: ArrayLike) -> float:
+    """Share of the area of a surface whose samples lie on planes, as `flattened` leaves them."""
+    areas = np.asarray(surface.areas, dtype=np.float64)
+    on_planes = np.zeros(len(areas), dtype=bool)
+    for face in flat_faces(surface, spacing):
+        on_planes |= face.members
+    return float(areas[on_planes].sum() / areas.sum())
 
 
 def _largest(

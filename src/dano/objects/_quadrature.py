@@ -34,7 +34,7 @@ _WEIGHTS = np.array([0.5 - _INNER_WEIGHT, _INNER_WEIGHT, _INNER_WEIGHT, 0.5 - _I
 _EDGE = 5
 # Rings of directions on a ball around where it touches, and directions a ring.
 _RINGS, _SPOKES = 15, 8
-# Rows of samples around a cylinder's axis are one less, so that one lies where it touches; rings on its ends.
+# Rows of samples around a cylinder's axis: one lies where it touches, one opposite. Rings on its ends.
 _ROWS, _END_RINGS = 24, 3
 # Where nothing better is known.
 _DRAWN = 1000
@@ -124,9 +124,14 @@ def _directions() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _around() -> tuple[np.ndarray, np.ndarray]:
-    """Directions about the z axis, x and others dense towards it, and the angle that each stands for."""
-    half = np.pi * np.linspace(0, 1, _ROWS // 2 + 1)[1:] ** 2
-    edges = np.concatenate([-half[::-1], half])
+    """Directions about the z axis, x and others dense towards it, and the angle that each stands for.
+
+    One is −x: the side on which a body lands that stood on the other.
+    """
+    half = np.linspace(0, 1, _ROWS // 2 + 1)[1:] ** 2
+    # The last stands for as much on both sides of −x as its neighbours do.
+    half = half * np.pi / (1 + (half[-1] - half[-2]) / 2)
+    edges = np.concatenate([-half[::-1], half, [2 * np.pi - half[-1]]])
     angles = 0.5 * (edges[1:] + edges[:-1])
     return np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1), np.diff(edges)
 

@@ -38,7 +38,11 @@ class BodyState:
     spin: vec3  # [rad/s, W]
     gain: vec3  # What gravity adds to the velocity within the step [m/s, W], zero for a body on a joint
     spin_gain: vec3  # What gyroscopic torque adds to the spin within the step [rad/s, W]; the same
+    falls: vec3  # `gain` without what supports the body [m/s, W]
     ahead_falling: quat  # Orientation at the end of the step with that gain; unused where there are joints
+    # Half of what the spin gains turns it by in a step [rad, W]: after a share τ it has turned by τ (1 − τ)
+    # of this less than the way to `ahead` says.
+    lag: vec3
     com: vec3  # Centre of mass in the field frame [m, F]
     inverse_mass: real  # Effective inverse mass [1/kg], zero for a fixed body
     inverse_inertia: mat33  # Effective inverse inertia [1/(kg m²), W], zero for a fixed body
@@ -126,7 +130,9 @@ def falling(body: BodyState, falls: int) -> BodyState:
     found = body
     if falls == 0:
         found.gain = vec3()
+        found.falls = vec3()
         found.spin_gain = vec3()
+        found.lag = vec3()
     elif wp.static(not TREES):
         found.ahead = body.ahead_falling
     return found
@@ -138,7 +144,9 @@ def falling_bar(bar: BodyState, falls: int) -> BodyState:
     found = bar
     if falls == 0:
         found.gain = vec3()
+        found.falls = vec3()
         found.spin_gain = vec3()
+        found.lag = vec3()
     elif wp.static(not TREES):
         found.ahead_falling = bar.ahead_falling + bar.ahead
         found.ahead = quat()
@@ -147,8 +155,16 @@ def falling_bar(bar: BodyState, falls: int) -> BodyState:
 
 @wp.func
 def rotation_after(body: BodyState, share: real) -> mat33:
-    """Rotation of a body after a share of the step."""
-    return matrix(interpolated(body.orientation, body.ahead, share))
+    """Rotation of a body after a share of the step.
+
+    A spin is that of the middle of the step before: the body has turned by τ h (ω + (1 + τ)/2 γ).
+    """
+    q = interpolated(body.orientation, body.ahead, share)
+    if wp.static(not TREES):
+        if wp.length_sq(body.lag) > ZERO:
+            half = (-HALF * share * (ONE - share)) * body.lag
+            q = wp.normalize(quat(half[0], half[1], half[2], ONE)) * q
+    return matrix(q)
 
 
 @wp.func
@@ -244,7 +260,7 @@ def pair_pose(
     pose.spin_gained_on_way = spin_gain
     pose.gained = (HALF + share) * gain
     pose.gained_on_way = (HALF * (ONE + share)) * gain
-    pose.gains_after = (HALF - share) * gain
+    pose.gains_after = (HALF - share) * (inverse * (first.falls - second.falls))
     seen = facing_map(turn, toward, turning, scale)
     pose.points = seen.points
     pose.vectors = seen.vectors

@@ -19,7 +19,17 @@ import warp as wp
 
 from dano.physics.features import LAW
 from dano.physics.friction import following_friction, Friction, friction, friction_with_dual, Slip
-from dano.physics.impacts import fading_in, Impact, impact_goal, impact_limit, is_impact, may_rest
+from dano.physics.impacts import (
+    fading_in,
+    gains_of,
+    Impact,
+    impact_goal,
+    impact_limit,
+    is_hit,
+    is_impact,
+    may_rest,
+    share_that_rebounds,
+)
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 from dano.physics.samples import Point
 
@@ -85,6 +95,7 @@ class PointLaw:
     goal: real  # v*, separating speed that an impact aims at [m/s]
     guard: real  # κ [Pa s/m]
     limit: real  # Separating speed below which the point would get deeper than the impact [m/s]
+    extra_slip: vec3  # What is added to the slip [m/s]
     if LAW:
         numbers: vec3  # Of a law of one's own; only where there is one
 
@@ -186,13 +197,19 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
     if material.instant == ZERO:
         law.damped *= sunk
         law.lost *= sunk
+    law.extra_slip = point.extra_slip
     if impact.stiffness > ZERO:
-        law.blow = impact.part * impact.stiffness * fading_in(point.sunk / impact.depth)
+        hit = is_hit(point.approach, material.bounce, impact.rests)
+        law.blow = impact.part * impact.stiffness * hit * fading_in(point.sunk / impact.depth)
         law.guard = impact.part * impact.stiffness
         law.limit = impact_limit(impact, point.depth, point.sunk)
-        law.goal = impact_goal(
-            impact, material.restitution, material.bounce, point.approach, point.meets, point.gains_after
-        )
+        gains = gains_of(impact, point.gains_after, point.arm, point.normal, material.friction)
+        rebound = -material.restitution * point.meets
+        rebounds = share_that_rebounds(rebound, material.bounce)
+        law.goal = impact_goal(impact, rebound, rebounds, point.approach, point.normal, gains)
+        gained = gains.falls + (ONE - rebounds) * gains.held
+        across = gained - wp.dot(point.normal, gained) * point.normal
+        law.extra_slip -= impact.delays * across
     law.restitution_velocity = wp.sqrt(
         wp.max(material.restitution_velocity * material.restitution_velocity, material.uplift * sunk)
     )
@@ -306,6 +323,13 @@ def point_motion(point: Point, velocity: vec3, spin: vec3) -> Motion:
     u = velocity + wp.cross(spin, point.arm)
     motion.rate = wp.dot(point.normal, velocity) + wp.dot(point.moment, spin)
     motion.slip = u - wp.dot(point.normal, u) * point.normal
+    return motion
+
+
+@wp.func
+def slip_of(law: PointLaw, motion: Motion) -> Motion:
+    """Motion with the extra slip of a point."""
+    motion.slip = motion.slip + law.extra_slip
     return motion
 
 

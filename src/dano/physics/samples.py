@@ -50,7 +50,7 @@ class Point:
     rate: real  # Separating speed at the old velocities [m/s]
     approach: real  # Separating speed with which the step begins [m/s]
     meets: real  # Separating speed in the predicted configuration [m/s]
-    gains_after: real  # What the separating speed at the end of the step gains from then on [m/s]
+    gains_after: vec3  # What its velocity at the end of the step gains from then on if it falls [m/s]
     area: real  # That faces the second body [m²]
     # Depth below the second body's surface in the predicted configuration [m], zero for a sample that faces
     # the other way.
@@ -196,5 +196,5 @@ def point_contact(
         point.approach = rate - nearing
         point.extra_slip = pose.rotation * (changed - nearing * normal)
     point.meets = point.approach + wp.dot(pose.gained, normal) + wp.dot(pose.spin_gained, moment)
-    point.gains_after = wp.dot(pose.gains_after, normal)
+    point.gains_after = pose.rotation * pose.gains_after
     return point

@@ -12,11 +12,23 @@ from dano.identification import Identification, identify, IdentifyOptions, Motio
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
 from dano.progress import Progress
 from dano.scene import Scene
-from dano.vision import adjust_poses, Film, LearnedField, Light, PosedCamera, Tracked, TrackOptions
+from dano.vision import (
+    adjust_poses,
+    Film,
+    LearnedField,
+    Light,
+    PosedCamera,
+    steady_film,
+    Tracked,
+    TrackOptions,
+)
 
 _SETTLED = 0.25
 """Move of a parameter, in its standard errors, that ends the search: each pass moves it by about half of what
 the one before did, and as much is left."""
+
+_NEARBY = 2.0
+"""Standard deviations of what pixels alone say up to which poses agree with them."""
 
 _LIGHT_PASSES = 2
 """Passes in which the light is fitted: after that poses are right, and it would only follow the noise."""
@@ -32,7 +44,7 @@ class FilmFit(NamedTuple):
     """Parameters from a film.
 
     Attributes:
-        fit: Values with error bars, and the motion that they give.
+        fit: Values with error bars, and the motion that they give; that of the poses if pixels add nothing.
         poses: The same from the poses alone, which the search began with.
         tracked: What the film shows at the motion found: quality and status of frames, light, silhouettes.
         history: Values of the parameters after each pass, the first of them from the poses alone.
@@ -71,8 +83,12 @@ def identify_in_film(
     simulated poses, and residuals of silhouettes and colours, weighted robustly, are linearised there: a step
     of Gauss–Newton on pixels, through renderer and simulation, in parameters and initial state. The light is
     fitted in between. Poses of the motion, which all frames together have made, count as much as what the
-    pixels of a frame say near the simulated one, and neither makes the other surer. Memory is that of one
-    frame beside the rollout.
+    pixels of a frame say near the simulated one, and neither makes the other surer.
+
+    Where most poses lie within two standard deviations of where the pixels want them, and the first step
+    moves no value by more than a quarter of its standard error, pixels say what the poses said. The fit of
+    the poses is the result then, and the search ends. Standard errors are never smaller than those from the
+    poses. Memory is that of one frame beside the rollout.
 
     Args:
         scene: The scene, with values for whatever is not a parameter.
@@ -100,6 +116,7 @@ def identify_in_film(
     body = motion.names[0]
     tracking = checked_optional("tracking", tracking, TrackOptions) or TrackOptions()
     tracking = _with_table(scene, motion, tracking)
+    film = steady_film(film, camera, background, tracking.readout)
     options = checked_optional("options", settings.pop("options", None), IdentifyOptions) or IdentifyOptions()
     # The trend of a rough loss is worth its simulations only where the search ends.
     on_the_way = dataclasses.replace(options, smooth=False)
@@ -120,18 +137,48 @@ def identify_in_film(
             progress=progress,
         )
         lamps = found.lamps if k + 1 >= _LIGHT_PASSES else None
-        pulled = _fused(Motion.from_tracked(found, body), motion)
+        alone = Motion.from_tracked(found, body)
+        pulled = _fused(alone, motion)
         last = fit
         fit = identify(
             scene, pulled, parameters, after=fit, progress=progress, options=on_the_way, **settings
         )
         history.append(fit.values)
-        if settled := _moved(last, fit) < _SETTLED and k + 1 >= _LIGHT_PASSES:
+        moved = _moved(last, fit)
+        if k == 0 and moved < _SETTLED and _agree(alone, motion):
+            # The poses were made of these pixels, which have nothing to add.
+            return FilmFit(before, before, found, tuple(history), True)
+        if settled := moved < _SETTLED and k + 1 >= _LIGHT_PASSES:
             break
     assert found is not None and pulled is not None
     if options.smooth:
         fit = identify(scene, pulled, parameters, after=fit, progress=progress, options=options, **settings)
-    return FilmFit(fit, before, found, tuple(history), settled)
+    return FilmFit(_no_smaller(fit, before), before, found, tuple(history), settled)
+
+
+def _agree(pulled: Motion, motion: Motion) -> bool:
+    """Whether poses of a motion lie where the pixels want them, by what pixels alone know."""
+    assert pulled.covariance is not None
+    known, seen = _information(pulled.covariance[:, 0])
+    seen &= np.isfinite(motion.position[:, 0]).all(axis=1)
+    turn = quat_log(quat_multiply(quat_conjugate(pulled.orientation[seen, 0]), motion.orientation[seen, 0]))
+    apart = np.concatenate([motion.position[seen, 0] - pulled.position[seen, 0], turn], axis=1)
+    square = np.einsum("ni,nij,nj->n", apart, known[seen], apart) / 6
+    return bool(seen.any()) and float(np.median(square)) < _NEARBY**2
+
+
+def _no_smaller(fit: Identification, before: Identification) -> Identification:
+    """A fit with errors that are nowhere smaller than those of another one of the same pixels."""
+    here, there = np.diagonal(fit.covariance), np.diagonal(before.covariance)
+    some = np.isfinite(here) & np.isfinite(there) & (here > 0)
+    wider = np.ones(len(here))
+    wider[some] = np.sqrt(np.maximum(there[some] / here[some], 1.0))
+    errors = {
+        name: np.maximum(np.asarray(error), np.asarray(before.standard_errors[name]))
+        for name, error in fit.standard_errors.items()
+    }
+    covariance = fit.covariance * np.outer(wider, wider)
+    return dataclasses.replace(fit, standard_errors=errors, covariance=covariance)
 
 
 def _with_table(scene: Scene, motion: Motion, options: TrackOptions) -> TrackOptions:

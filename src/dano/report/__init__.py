@@ -7,6 +7,7 @@ from dano.report._comparison import (
     write_comparison_report as write_comparison_report,
 )
 from dano.report._framing import CAMERAS as CAMERAS
+from dano.report._grades import write_grades as write_grades
 from dano.report._identification import (
     draw_simulated as draw_simulated,
     write_film_report as write_film_report,

@@ -233,8 +233,14 @@ def _before_and_after(found: FilmFit) -> str:
         for (label, before), (_, after) in zip(_rows(found.poses), _rows(found.fit), strict=True)
     ]
     head = ("parameter", "from poses", "standard error", "from pixels", "standard error", "95 % interval")
-    passes = f"{len(found.history) - 1} passes over {found.tracked.n_tracked} of {len(found.tracked.status)}"
+    count = len(found.history) - 1
+    passes = f"{count} pass{'es' * (count > 1)} over {found.tracked.n_tracked} of {len(found.tracked.status)}"
     settled = "" if found.settled else "; the values had not settled after the last one"
+    if found.fit is found.poses:
+        settled = (
+            "; the pixels moved no value by more than a quarter of its standard error: they are what the"
+            " poses were made from, so the values of the poses are the result"
+        )
     return table(head, rows) + f"<p>{passes} frames{settled}.</p>"
 
 

@@ -26,7 +26,7 @@ from dano.scene._frames import (
     triples as triples,
 )
 from dano.scene._joint_laws import JointLaws as JointLaws
-from dano.scene._joints import joined as joined, Joint as Joint, JOINT_KINDS as JOINT_KINDS, Layout as Layout
+from dano.scene._joints import Joint as Joint, JOINT_KINDS as JOINT_KINDS, Layout as Layout
 from dano.scene._loops import Loop as Loop, LOOP_KINDS as LOOP_KINDS, Loops as Loops
 from dano.scene._motors import Motor as Motor, MOTOR_KINDS as MOTOR_KINDS
 from dano.scene._others import (

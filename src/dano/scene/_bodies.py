@@ -1,9 +1,10 @@
 """Bodies: geometry, mass properties, and a name."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -212,7 +213,7 @@ class Body(eqx.Module):
         return isinstance(self.shape, Cylinder | HalfSpace)
 
     @property
-    def centre_of_mass(self) -> Float[Array, "3"]:
+    def centre_of_mass(self) -> Float[AnyArray, "3"]:
         """Where the centre of mass lies, with its offset [m, F]."""
         return self.com + self.com_offset
 
@@ -251,10 +252,11 @@ class Body(eqx.Module):
         return int(np.max(np.sum(heights <= heights.min(axis=1, keepdims=True) + layer, axis=1)))
 
     @property
-    def scale(self) -> Float[Array, "3"]:
+    def scale(self) -> Float[AnyArray, "3"]:
         """What directions on the unit ball are multiplied with to lie on the surface [m]; ones if unused."""
         if self.surface is None or self.surface.turning != "ball":
-            return floating(np.ones(3, self.com.dtype))
+            ones = np.ones(3, self.com.dtype)
+            return ones if library(self.com) is np else floating(ones)
         if isinstance(self.shape, Sphere):
             return stacked([self.shape.radius] * 3)
         assert isinstance(self.shape, Ellipsoid)
@@ -283,7 +285,7 @@ class Body(eqx.Module):
 
     def unused(self) -> "Body":
         """This body without what distributed contact asks of it."""
-        nothing = (None, jnp.zeros(6, self.com.dtype))
+        nothing = (None, np.zeros(6, self.com.dtype))
         return eqx.tree_at(lambda b: (b.surface, b.extent), self, nothing, is_leaf=lambda x: x is None)
 
     def collider(self, position: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> Collider:
@@ -416,10 +418,34 @@ def _homogeneous(name: str, shape: AbstractShape, mass: float) -> MassProperties
     return MassProperties(mass, moments.centroid, np.trace(second) * np.eye(3) - second)
 
 
+def alike(bodies: Sequence[Body]) -> list[int]:
+    """For each body the first that has the same object, or a shape with the same numbers."""
+    first: dict[Any, int] = {}
+    return [first.setdefault(_geometry(body, i), i) for i, body in enumerate(bodies)]
+
+
+def _geometry(body: Body, number: int) -> Hashable:
+    """What bodies with the same geometry have in common; that of a body alone where numbers are traced."""
+    if body.object is not None:
+        return id(body.object)
+    leaves, tree = jax.tree.flatten((body.shape, body.surface, body.extent))
+    if is_traced(leaves):
+        return -1 - number
+    return tree, tuple((x.shape, x.tobytes()) for x in map(np.asarray, leaves))
+
+
+def by_geometry(function: Callable[[Body], Any], bodies: Sequence[Body]) -> list[Any]:
+    """A function of each body that depends on its geometry alone: each geometry is looked at once."""
+    kinds = alike(bodies)
+    found = {i: function(bodies[i]) for i in dict.fromkeys(kinds)}
+    return [found[i] for i in kinds]
+
+
 def are_flat(bodies: Sequence[Body]) -> list[bool]:
-    """Which bodies are flat; an object that several of them have is looked at once."""
-    found: dict[int, bool] = {}
-    for body in bodies:
-        if body.object is not None and id(body.object) not in found:
-            found[id(body.object)] = body.is_flat
-    return [body.is_flat if body.object is None else found[id(body.object)] for body in bodies]
+    """Which bodies are flat."""
+    return by_geometry(lambda body: body.is_flat, bodies)
+
+
+def sizes_of(bodies: Sequence[Body]) -> Float[np.ndarray, " n"]:
+    """`Body.size` of bodies [m]."""
+    return np.array(by_geometry(lambda body: body.size, bodies), float)

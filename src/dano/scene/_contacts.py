@@ -6,7 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from dano.contact import (
     AbstractContactLaw,
@@ -22,7 +22,7 @@ from dano.contact import (
 from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
 from dano.maths import AnyArray, by_numpy, floating, library, Numbers, Q
 from dano.objects import draw_contact_samples, NeuralObject, surface_quadrature
-from dano.scene._bodies import are_flat, Body
+from dano.scene._bodies import are_flat, Body, by_geometry, sizes_of
 from dano.scene._states import State
 
 # Edge width of a primitive relative to the size of what touches it: 0.5 % made gradients and rest
@@ -105,7 +105,11 @@ def prepared(
     """
     by_name = {body.name: body for body in bodies}
     # Measured once: pairs are many.
-    sizes = {body.name: body.size for body in bodies}
+    names = [body.name for body in bodies]
+    sizes = dict(zip(names, sizes_of(bodies).tolist(), strict=True))
+    pressed = {name for contact in contacts if contact.law.presses for name in (contact.a, contact.b)}
+    rows = [body for body in bodies if body.name in pressed]
+    by_name |= {body.name: body for body in with_surfaces(rows)}
     for contact in contacts:
         a, b = by_name[contact.a], by_name[contact.b]
         if a.fixed and b.fixed:
@@ -115,9 +119,7 @@ def prepared(
         if a.object is not None and b.object is not None:
             check_objects(contact, a.object, b.object)
         for body in (a, b):
-            if contact.law.presses:
-                by_name[body.name] = with_surface(body)
-            elif _needs_samples(a, b) and not body.fixed:
+            if not contact.law.presses and _needs_samples(a, b) and not body.fixed:
                 by_name[body.name] = _with_samples(body)
     weight, strength = heaviest(bodies, gravity)
     carried = functools.cache(lambda name, sinking: by_name[name].typical_support(sinking * sizes[name]))
@@ -157,7 +159,7 @@ def colliders(
     return sides[0], sides[1]
 
 
-def pressing_pairs(bodies: Sequence[Body], ends: Sequence[tuple[int, int]]) -> list[tuple[int, int, int]]:
+def pressing_pairs(bodies: Sequence[Body], ends: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, "pairs 3"]:
     """Pairs (first, second, contact) of which the first body's samples press on the second's solid.
 
     Args:
@@ -168,17 +170,14 @@ def pressing_pairs(bodies: Sequence[Body], ends: Sequence[tuple[int, int]]) -> l
     own lie where it comes closest, and are enough.
     """
     turning = [None if body.surface is None else body.surface.turning for body in bodies]
-    is_object = [body.object is not None for body in bodies]
-    has_solid = [body.solid is not None for body in bodies]
-    pairs = []
-    for k, pair in enumerate(ends):
-        for i, j in (pair, pair[::-1]):
-            if turning[i] is None or not has_solid[j]:
-                continue
-            if turning[j] == "ball" and turning[i] != "ball" and not is_object[i]:
-                continue
-            pairs.append((i, j, k))
-    return pairs
+    sampled = np.array([turns is not None for turns in turning], bool)
+    ball = np.array([turns == "ball" for turns in turning], bool)
+    is_object = np.array([body.object is not None for body in bodies], bool)
+    has_solid = np.array([body.solid is not None for body in bodies], bool)
+    first, second = np.stack([ends, ends[:, ::-1]], axis=1).reshape(-1, 2).T
+    contact = np.repeat(np.arange(len(ends)), 2)
+    press = sampled[first] & has_solid[second] & ~(ball[second] & ~ball[first] & ~is_object[first])
+    return np.stack([first, second, contact], axis=1)[press]
 
 
 def _shape_with_edge(shape: AbstractShape, edge: Array | None) -> AbstractShape:
@@ -241,14 +240,25 @@ def _with_samples(body: Body) -> Body:
     return eqx.tree_at(lambda b: b.samples, body, samples, is_leaf=_none)
 
 
-def with_surface(body: Body) -> Body:
-    """The body with its extent and, unless it has no end, samples of its surface."""
-    if body.extent is None:
-        body = eqx.tree_at(lambda b: b.extent, body, body.measured(), is_leaf=_none)
-    if body.surface is None and body.shape is not None and np.isfinite(body.size):
+def with_surfaces(bodies: Sequence[Body]) -> list[Body]:
+    """Bodies with their extents and, unless they have no end, samples of their surfaces."""
+    found = by_geometry(_measured, bodies)
+    # All at once: each replacement by `eqx.tree_at` looks at all of a tree.
+    values = [x for each in found for x in each]
+    return eqx.tree_at(
+        lambda all: [x for body in all for x in (body.extent, body.surface)],
+        list(bodies),
+        values,
+        is_leaf=lambda x: x is None or isinstance(x, SurfaceSet),
+    )
+
+
+def _measured(body: Body) -> tuple[Float[Array, "6"], SurfaceSet | None]:
+    """Extent, and samples of the surface, of a body."""
+    extent, surface = body.extent, body.surface
+    if surface is None and body.shape is not None and np.isfinite(body.size):
         surface = SurfaceSet.create(*surface_quadrature(body.shape))
-        body = eqx.tree_at(lambda b: b.surface, body, surface, is_leaf=_none)
-    return body
+    return body.measured() if extent is None else extent, surface
 
 
 def _stiffness(

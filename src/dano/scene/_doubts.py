@@ -9,14 +9,13 @@ import warnings
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from dano.fields import HalfSpace
 from dano.maths import is_traced, quat_rotate
 from dano.names import see
-from dano.scene._bodies import Body
+from dano.scene._bodies import Body, by_geometry, sizes_of
 from dano.scene._contacts import Contact
 from dano.scene._frames import RESOLVED
 from dano.scene._joints import Joint, Layout
@@ -110,10 +109,16 @@ def doubts_of_scene(
             )
             found.append(Doubt(3, f"{text} has: it is a ratio of forces, not an angle"))
         found += _too_soft(contact, bodies, gravity)
-    for body in bodies:
-        traced = is_traced(body.shape, body.mass, body.mass_scale, body.inertia)
-        if not body.fixed and not traced and body.name not in seen:
-            found += _of_body(body)
+    judged = [
+        body
+        for body in bodies
+        if not body.fixed
+        and body.name not in seen
+        and not is_traced(body.shape, body.object, body.mass, body.mass_scale, body.inertia)
+    ]
+    boxes, sizes = by_geometry(_bounds, judged), sizes_of(judged).tolist()
+    for body, box, size in zip(judged, boxes, sizes, strict=True):
+        found += _of_body(body, box, size)
     by_name = {body.name: body for body in bodies}
     for joint in joints:
         if not is_traced(joint):
@@ -151,9 +156,13 @@ def _too_soft(contact: Contact, bodies: Sequence[Body], gravity: Float[Array, "3
 
 def is_homogeneous(body: Body) -> bool:
     """Whether a body's mass can lie within its shape: its radius of gyration is not larger than that."""
+    return _gyration(body) <= body.size
+
+
+def _gyration(body: Body) -> float:
+    """Radius of gyration [m]."""
     mass = float(body.mass)
-    gyration = math.sqrt(max(float(np.trace(np.asarray(body.inertia, np.float64))), 0.0) / (2 * mass))
-    return gyration <= body.size
+    return math.sqrt(max(float(np.trace(np.asarray(body.inertia, np.float64))), 0.0) / (2 * mass))
 
 
 def box_volume(body: Body) -> float:
@@ -161,15 +170,15 @@ def box_volume(body: Body) -> float:
     return float(np.prod(_extents(body)))
 
 
-def density_doubt(body: Body) -> str | None:
+def density_doubt(body: Body, box: Float[np.ndarray, "2 3"], size: float) -> str | None:
     """What to say of a body that is lighter than air or heavier than any metal, for the box around it."""
-    mass, volume = float(body.mass * body.mass_scale), box_volume(body)
+    mass, volume = float(body.mass) * float(body.mass_scale), float(np.prod(np.ptp(box, axis=0)))
     density = mass / max(volume, 1e-300)
-    if LIGHTEST <= density <= HEAVIEST or not is_homogeneous(body):
+    if LIGHTEST <= density <= HEAVIEST or _gyration(body) > size:
         return None
     than = "more than any metal has" if density > 1 else "less than air has"
     return (
-        f"{body.name!r} is {body.size:.3g} m long and has {mass:.3g} kg, {density:.2g} kg/m³ of the box"
+        f"{body.name!r} is {size:.3g} m long and has {mass:.3g} kg, {density:.2g} kg/m³ of the box"
         f" around it, {than}; are its lengths in metres and its mass in kilograms?"
     )
 
@@ -187,17 +196,16 @@ def _bounds(body: Body) -> Float[np.ndarray, "2 3"]:
     return np.asarray(body.shape.bounds, np.float64)
 
 
-def _of_body(body: Body) -> list[Doubt]:
-    if is_traced(jax.tree.leaves(body.object)):
-        return []
+def _of_body(body: Body, box: Float[np.ndarray, "2 3"], size: float) -> list[Doubt]:
+    """What is odd about a body, with the box around it [m, F] and its size [m]."""
     found = []
-    if (text := density_doubt(body)) is not None:
+    if (text := density_doubt(body, box, size)) is not None:
         found.append(Doubt(0, text))
-    elif _LONGEST < body.size < np.inf:
-        found.append(Doubt(0, f"{body.name!r} is {body.size:.3g} m long: are its lengths in metres?"))
-    if (away := _beside(body)) > _FAR * body.size:
+    elif _LONGEST < size < np.inf:
+        found.append(Doubt(0, f"{body.name!r} is {size:.3g} m long: are its lengths in metres?"))
+    if (away := _beside(body, box)) > _FAR * size:
         text = (
-            f"the centre of mass of {body.name!r} lies {away:.3g} m beside its shape, {away / body.size:.2g}"
+            f"the centre of mass of {body.name!r} lies {away:.3g} m beside its shape, {away / size:.2g}"
             " times its size: it is a point of the body's own frame"
         )
         found.append(Doubt(3, text))
@@ -206,17 +214,17 @@ def _of_body(body: Body) -> list[Doubt]:
     if edge is not None and not is_traced(edge) and float(edge) > _WIDEST_EDGE * thin:
         text = f"the edge of {body.name!r} is {float(edge):.3g} m wide and its shape {thin:.3g} m thick"
         found.append(Doubt(3, f"{text}: it has no inside"))
-    if thin < _THINNEST * body.size:
-        text = f"{body.name!r} is {thin:.2g} m thick and {body.size:.2g} m long: too thin for its samples"
+    if thin < _THINNEST * size:
+        text = f"{body.name!r} is {thin:.2g} m thick and {size:.2g} m long: too thin for its samples"
         found.append(Doubt(5, text))
     return found
 
 
-def _beside(body: Body) -> float:
+def _beside(body: Body, box: Float[np.ndarray, "2 3"]) -> float:
     """How far the centre of mass lies beside the box around a body [m]; 0 of what has none or is endless."""
-    if not np.isfinite(body.size) or is_traced(body.com):
+    if not np.all(np.isfinite(box)) or is_traced(body.com):
         return 0.0
-    low, high = _bounds(body)
+    low, high = box
     com = np.asarray(body.com, np.float64)
     return float(np.linalg.norm(np.maximum(0, np.maximum(low - com, com - high))))
 
@@ -263,7 +271,7 @@ def _of_joint(joint: Joint, body: Body | None) -> list[Doubt]:
 
 def doubts_of_state(
     bodies: Sequence[Body],
-    pairs: Sequence[tuple[int, int]],
+    pairs: Int[np.ndarray, "k 2"],
     layout: Layout,
     state: State,
     timestep: float,
@@ -281,19 +289,20 @@ def doubts_of_state(
     position, speeds = np.asarray(state.position, np.float64), np.asarray(state.velocity, np.float64)
     spins, orientation = np.asarray(state.omega, np.float64), np.asarray(state.orientation, np.float64)
     rounding = float(np.finfo(state.position.dtype).eps)
+    sizes = sizes_of(bodies).tolist()
     for i in layout.free:
-        body = bodies[i]
+        body, size = bodies[i], sizes[i]
         far = float(np.abs(position[i]).max())
-        if np.isfinite(body.size) and far * rounding > _COARSE * body.size:
+        if np.isfinite(size) and far * rounding > _COARSE * size:
             apart = f"where numbers are {far * rounding:.1g} m apart"
             text = f"{body.name!r} lies {far:.3g} m from the origin, {apart}"
             found.append(Doubt(2, f"{text}: is its position in metres?"))
         way = float(np.linalg.norm(speeds[i])) * timestep
-        if np.isfinite(body.size) and way > _LEAPS * body.size and way > 0:
+        if np.isfinite(size) and way > _LEAPS * size and way > 0:
             found.append(
                 Doubt(
                     1,
-                    f"{body.name!r} goes {way:.3g} m in a step, {way / body.size:.2g} times its size: is its"
+                    f"{body.name!r} goes {way:.3g} m in a step, {way / size:.2g} times its size: is its"
                     " velocity in m/s?",
                 )
             )
@@ -323,7 +332,8 @@ def doubts_of_state(
     for i, body in enumerate(bodies):
         if body.fixed and (np.any(speeds[i]) or np.any(spins[i])):
             found.append(Doubt(3, f"{body.name!r} is fixed: the velocity of its state moves nothing"))
-    for i, j in pairs:
+    floors = [i for i, body in enumerate(bodies) if isinstance(body.shape, HalfSpace)]
+    for i, j in pairs[np.isin(pairs, floors).any(axis=1)].tolist():
         found += _begins_inside(bodies, position, orientation, i, j)
     return found
 

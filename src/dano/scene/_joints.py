@@ -1,12 +1,12 @@
 """Joints between bodies, and the layout of the coordinates that they leave free."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from dano.checks import checked_choice, checked_optional, checked_text
 from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
@@ -231,10 +231,11 @@ class Layout(NamedTuple):
         return self.children.index(body) if body in self.children else None
 
 
-def joined(joints: Sequence[Joint | Loop]) -> Callable[[str, str], bool]:
-    """Whether two bodies are parts of one rigid body, or neighbours: they overlap where a joint is.
+def unjoined(names: Sequence[str], joints: Sequence[Joint | Loop]) -> Bool[np.ndarray, "n n"]:
+    """Which bodies are neither parts of one rigid body nor neighbours, which overlap where a joint is.
 
     Args:
+        names: Of the bodies.
         joints: The joints of a scene, and its loops.
     """
     link: dict[str | None, str | None] = {}
@@ -248,13 +249,13 @@ def joined(joints: Sequence[Joint | Loop]) -> Callable[[str, str], bool]:
         if isinstance(joint, Joint) and joint.kind == "weld":
             link[link_of(joint.child)] = link_of(joint.parent)
     ends = [(x.parent, x.child) if isinstance(x, Joint) else (x.first, x.second) for x in joints]
-    neighbours = {frozenset((link_of(a), link_of(b))) for a, b in ends if link_of(a) != link_of(b)}
-
-    def check(a: str, b: str) -> bool:
-        ends = frozenset((link_of(a), link_of(b)))
-        return len(ends) == 1 or ends in neighbours
-
-    return check
+    number: dict[str | None, int] = {}
+    of_bodies = np.array([number.setdefault(link_of(name), len(number)) for name in names], int)
+    apart = ~np.eye(len(number), dtype=bool)
+    for a, b in ends:
+        links = [number[link] for link in (link_of(a), link_of(b)) if link in number]
+        apart[np.ix_(links, links)] = False
+    return apart[np.ix_(of_bodies, of_bodies)]
 
 
 @functools.lru_cache(maxsize=256)

@@ -1,6 +1,7 @@
 """What is checked when a scene is made, and what its steps have room for."""
 
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -10,7 +11,7 @@ from dano.contact import CHUNK, ContactParams
 from dano.maths import is_traced
 from dano.names import did_you_mean
 from dano.physics.trees.sizes import CLOSES
-from dano.scene._bodies import Body
+from dano.scene._bodies import Body, sizes_of
 from dano.scene._contacts import Contact
 from dano.scene._joints import Joint, Layout, layout_of
 
@@ -31,10 +32,9 @@ def check_names(bodies: Sequence[Body]) -> None:
     """
     if not bodies:
         raise ValueError("bodies must hold at least one body, got none")
-    names = [body.name for body in bodies]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"bodies must have different names, got {name!r} {names.count(name)} times")
+    for name, count in Counter(body.name for body in bodies).items():
+        if count > 1:
+            raise ValueError(f"bodies must have different names, got {name!r} {count} times")
 
 
 def check_contacts(bodies: Sequence[Body], joints: Sequence[Joint], contacts: Sequence[Contact]) -> None:
@@ -61,9 +61,20 @@ def check_contacts(bodies: Sequence[Body], joints: Sequence[Joint], contacts: Se
 
 def twins_of(bodies: Sequence[Body]) -> tuple[int, ...]:
     """For each body the first that is made of the same object, see `Scene.twins`."""
-    objects = [body.object for body in bodies]
+    first: dict[int, int] = {}
     return tuple(
-        i if o is None else next(j for j, p in enumerate(objects) if p is o) for i, o in enumerate(objects)
+        i if body.object is None else first.setdefault(id(body.object), i) for i, body in enumerate(bodies)
+    )
+
+
+def sampled_alike(bodies: Sequence[Body], twins: Sequence[int]) -> tuple[int, ...]:
+    """For each body the first with the same samples, see `Scene.sampled`."""
+    first: dict[int, int] = {}
+    return tuple(
+        twins[i]
+        if body.object is not None or body.surface is None
+        else first.setdefault(id(body.surface.points), i)
+        for i, body in enumerate(bodies)
     )
 
 
@@ -102,7 +113,8 @@ def warn_of_long_steps(
     """Warn if gravity alone moves the smallest body by a good part of its size in a step."""
     if is_traced(timestep, gravity, [body.extent for body in bodies]):
         return
-    sizes = [(body.size, body.name) for body in bodies if not body.fixed]
+    free = [body for body in bodies if not body.fixed]
+    sizes = [(size, body.name) for size, body in zip(sizes_of(free).tolist(), free, strict=True)]
     h, strength = float(timestep), float(np.linalg.norm(np.asarray(gravity)))
     if not sizes or h * h * strength <= LONGEST_FALL * min(sizes)[0]:
         return

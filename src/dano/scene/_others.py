@@ -1,28 +1,26 @@
 """Pairs of bodies that no contact names: what may touch, and what the bodies are made of."""
 
 import functools
-import itertools
-import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, overload
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from dano.checks import shown
 from dano.contact import combined, ContactParams, DistributedLaw, Setting
-from dano.scene._bodies import are_flat, Body
+from dano.maths import AnyArray, by_numpy, library, Q
+from dano.scene._bodies import alike, are_flat, Body, sizes_of
 from dano.scene._contacts import (
     check_objects,
     checked_support,
     Contact,
     heaviest,
-    with_surface,
+    with_surfaces,
 )
-from dano.scene._joints import joined, Joint
+from dano.scene._joints import Joint, unjoined
 from dano.scene._loops import Loop
 
 MOST_LISTED = 200
@@ -37,6 +35,49 @@ class OfEdges(NamedTuple):
     impact_depth: Float[Array, " n"]  # δ [m]
 
 
+class Pairs(Sequence[tuple[int, int]]):
+    """Pairs of indices: half a million of them are an array, not as many tuples.
+
+    Attributes:
+        array: The pairs, shape (k, 2); not to be written to.
+    """
+
+    def __init__(self, array: Int[np.ndarray, "k 2"]):
+        """See the class."""
+        self.array = np.ascontiguousarray(array, np.int32).reshape(-1, 2)
+        self.array.flags.writeable = False
+        self._hash: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.array)
+
+    @overload
+    def __getitem__(self, index: int) -> tuple[int, int]: ...
+    @overload
+    def __getitem__(self, index: slice) -> "Pairs": ...
+    def __getitem__(self, index: int | slice) -> "tuple[int, int] | Pairs":
+        if isinstance(index, slice):
+            return Pairs(self.array[index])
+        first, second = self.array[index].tolist()
+        return first, second
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        return map(tuple, self.array.tolist())
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, Pairs):
+            return self is other or np.array_equal(self.array, other.array)
+        return NotImplemented
+
+    def __hash__(self) -> int:
+        if self._hash is None:
+            self._hash = hash(self.array.tobytes())
+        return self._hash
+
+    def __repr__(self) -> str:
+        return f"Pairs({shown(self.array.tolist())})"
+
+
 class Others(eqx.Module):
     """All pairs of bodies that no contact of a scene names.
 
@@ -47,14 +88,14 @@ class Others(eqx.Module):
         of_edges: Some of them where edges and faces of both bodies are known.
         law: Of all these pairs.
         pairs: Indices of the bodies of each pair (static).
-        sharp: Whether in a pair edges and faces of both bodies are known (static).
+        flat: Whether edges and faces of each body are known (static).
     """
 
     params: ContactParams
     of_edges: OfEdges
     law: DistributedLaw
-    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    sharp: tuple[bool, ...] = eqx.field(static=True)
+    pairs: Pairs = eqx.field(static=True)
+    flat: tuple[bool, ...] = eqx.field(static=True)
 
     @property
     def pair_params(self) -> ContactParams:
@@ -63,14 +104,17 @@ class Others(eqx.Module):
         √(μ_a μ_b) of the sliding frictions; of restitution, stiffness, hysteresis and fading the larger; of
         `restitution_velocity`, `impact_depth` and `friction_pressure` the smaller.
         """
-        first, second = np.array(self.pairs, int).reshape(-1, 2).T
+        first, second = self.pairs.array.T
         a, b = (jax.tree.map(lambda x, rows=rows: x[rows], self.params) for rows in (first, second))
         found = combined(a, b)
-        if not any(self.sharp):
+        flat = np.array(self.flat)
+        sharp = flat[first] & flat[second]
+        if not sharp.any():
             return found
-        k, depth, sharp = *self.of_edges, np.array(self.sharp)
-        stiffness = jnp.where(sharp, jnp.maximum(k[first], k[second]), found.stiffness)
-        depth = jnp.where(sharp, jnp.minimum(depth[first], depth[second]), found.impact_depth)
+        xp = library(*jax.tree.leaves((self.params, self.of_edges)))
+        k, depth = self.of_edges
+        stiffness = xp.where(sharp, xp.maximum(k[first], k[second]), found.stiffness)
+        depth = xp.where(sharp, xp.minimum(depth[first], depth[second]), found.impact_depth)
         return eqx.tree_at(lambda p: (p.stiffness, p.impact_depth), found, (stiffness, depth))
 
 
@@ -103,26 +147,28 @@ def others_of(
     for given in (params, *(body.material for body in bodies)):
         if given is not None:
             law.check(given)
+    place = {body.name: i for i, body in enumerate(bodies)}
     left_out = {frozenset(pair) for pair in apart} | {frozenset((c.a, c.b)) for c in contacts}
-    neighbours = joined(joints)
-    ends = [_Ends.of(body, True) for body in bodies]
-    pairs = []
-    for (i, a), (j, b) in itertools.combinations(enumerate(ends), 2):
-        if (left_out and frozenset((a.name, b.name)) in left_out) or neighbours(a.name, b.name):
-            continue
+    left = unjoined([body.name for body in bodies], joints)
+    for pair in left_out:
+        left[np.ix_(*2 * ([place[name] for name in pair],))] = False
+    ends = _Ends.of(bodies, True)
+    may = ends.can_touch()
+    moves = ~(ends.fixed[:, None] & ends.fixed)
+    # Two objects of which neither has a solid: that is said.
+    for i, j in np.argwhere(np.triu(left & ~may & moves & (ends.is_object[:, None] & ends.is_object), 1)):
         first, second = bodies[i].object, bodies[j].object
-        if a.can_touch(b):
-            pairs.append((i, j))
-        elif not (a.fixed and b.fixed) and first is not None and second is not None:
-            check_objects(Contact(a.name, b.name), first, second)
+        assert first is not None and second is not None
+        check_objects(Contact(bodies[i].name, bodies[j].name), first, second)
+    pairs = Pairs(np.argwhere(np.triu(left & may, 1)))
     if not pairs:
         return tuple(bodies), None
-    touching = {i for pair in pairs for i in pair}
-    bodies = tuple(with_surface(body) if i in touching else body for i, body in enumerate(bodies))
+    touching = np.unique(pairs.array).tolist()
+    prepared = dict(zip(touching, with_surfaces([bodies[i] for i in touching]), strict=True))
+    bodies = tuple(prepared.get(i, body) for i, body in enumerate(bodies))
     flat = are_flat(bodies)
-    sharp = tuple(flat[i] and flat[j] for i, j in pairs)
-    complete, of_edges = _stacked(bodies, pairs, sharp, law, params, timestep, gravity)
-    return bodies, Others(complete, of_edges, law, tuple(pairs), sharp)
+    complete, of_edges = _stacked(bodies, touching, flat, law, params, timestep, gravity)
+    return bodies, Others(complete, of_edges, law, pairs, tuple(flat))
 
 
 def unnamed_contacts(
@@ -143,11 +189,16 @@ def unnamed_contacts(
         ValueError: If `apart` names an unknown body.
     """
     _check_apart(bodies, apart)
-    left_out = {frozenset(pair) for pair in apart}
-    pairs = [pair for pair in touching_pairs(bodies, joints) if frozenset(pair) not in left_out]
-    if len(pairs) > MOST_LISTED or any(body.material is not None for body in bodies):
+    if any(body.material is not None for body in bodies):
         return None
-    return [Contact(a, b) for a, b in pairs]
+    may = _Ends.of(bodies, True).can_touch() & unjoined([body.name for body in bodies], joints)
+    place = {body.name: i for i, body in enumerate(bodies)}
+    for a, b in apart:
+        may[[place[a], place[b]], [place[b], place[a]]] = False
+    pairs = np.argwhere(np.triu(may, 1)).tolist()
+    if len(pairs) > MOST_LISTED:
+        return None
+    return [Contact(bodies[i].name, bodies[j].name) for i, j in pairs]
 
 
 def touching_pairs(
@@ -160,36 +211,36 @@ def touching_pairs(
         joints: And loops: what joins does not touch.
         presses: Whether the law of the contacts acts at points, see `AbstractContactLaw`.
     """
-    apart = joined(joints)
-    ends = [_Ends.of(body, presses) for body in bodies]
-    return [
-        (a.name, b.name)
-        for a, b in itertools.combinations(ends, 2)
-        if a.name != b.name and a.can_touch(b) and not apart(a.name, b.name)
-    ]
+    names = [body.name for body in bodies]
+    may = _Ends.of(bodies, presses).can_touch() & unjoined(names, joints)
+    pairs = np.argwhere(np.triu(may, 1)).tolist()
+    return [(names[i], names[j]) for i, j in pairs if names[i] != names[j]]
 
 
 class _Ends(NamedTuple):
-    """What decides whether `Scene.create` would accept a contact of a body with another."""
+    """What decides whether `Scene.create` would accept contacts of bodies, arrays of shape (n,)."""
 
-    name: str
-    fixed: bool
-    is_object: bool
-    has_solid: bool  # Of an object: whether others' samples can ask it
-    finite: bool
+    fixed: Bool[np.ndarray, " n"]
+    is_object: Bool[np.ndarray, " n"]
+    has_solid: Bool[np.ndarray, " n"]  # Of an object: whether others' samples can ask it
+    finite: Bool[np.ndarray, " n"]
 
     @classmethod
-    def of(cls, body: Body, presses: bool) -> "_Ends":
-        obj = body.object
-        solid = None if obj is None else obj.solid if presses else obj.grid
-        return cls(body.name, body.fixed, obj is not None, solid is not None, math.isfinite(body.size))
+    def of(cls, bodies: Sequence[Body], presses: bool) -> "_Ends":
+        objects = [body.object for body in bodies]
+        solids = [None if o is None else o.solid if presses else o.grid for o in objects]
+        return cls(
+            np.array([body.fixed for body in bodies], bool),
+            np.array([o is not None for o in objects], bool),
+            np.array([solid is not None for solid in solids], bool),
+            np.isfinite(sizes_of(bodies)),
+        )
 
-    def can_touch(self, other: "_Ends") -> bool:
-        if self.fixed and other.fixed:
-            return False
-        if self.is_object and other.is_object:
-            return self.has_solid or other.has_solid
-        return self.finite or other.finite
+    def can_touch(self) -> Bool[np.ndarray, "n n"]:
+        """Whether there can be a contact of each with each other."""
+        objects = self.is_object[:, None] & self.is_object
+        met = np.where(objects, self.has_solid[:, None] | self.has_solid, self.finite[:, None] | self.finite)
+        return met & ~(self.fixed[:, None] & self.fixed)
 
 
 def _check_apart(bodies: Sequence[Body], apart: Sequence[tuple[str, str]]) -> None:
@@ -211,8 +262,8 @@ def _check_apart(bodies: Sequence[Body], apart: Sequence[tuple[str, str]]) -> No
 
 def _stacked(
     bodies: Sequence[Body],
-    pairs: Sequence[tuple[int, int]],
-    sharp: Sequence[bool],
+    touching: Sequence[int],
+    flat: Sequence[bool],
     law: DistributedLaw,
     usual: ContactParams,
     timestep: Float[Array, ""],
@@ -223,29 +274,75 @@ def _stacked(
     What does not move or has no end presses as softly, and is as large, as what it may meet: the other body
     decides.
     """
-    touching = {i for pair in pairs for i in pair}
     weight, strength = heaviest(bodies, gravity)
+    own = sizes_of(bodies)
     moving = [i for i in touching if not bodies[i].fixed]
-    largest = max(bodies[i].size for i in moving)
+    sizes = np.minimum(own, max(own[i] for i in moving))
+    kinds = alike(bodies)
 
     @functools.cache
-    def stiffness(i: int, sinking: float) -> Float[Array, ""]:
-        support = bodies[i].typical_support(sinking * bodies[i].size)
-        return weight / checked_support(bodies[i], support, "in others must be given")
+    def support(kind: int, sinking: float) -> float:
+        body = bodies[kind]
+        found = body.typical_support(sinking * own[kind])
+        return checked_support(body, found, "in others must be given")
 
-    def rule(i: int) -> Callable[[float], Float[Array, ""]]:
-        decide = [i] if i in moving else moving
-        return lambda sinking: functools.reduce(jnp.minimum, [stiffness(k, sinking) for k in decide])
+    def stiffness(asked: set[int], sinking: float) -> Float[AnyArray, " n"]:
+        # What does not move takes the least of what does.
+        largest = max(support(kinds[i], sinking) for i in (asked if asked <= set(moving) else moving))
+        every = [
+            support(kinds[i], sinking) if i in asked and not body.fixed else largest
+            for i, body in enumerate(bodies)
+        ]
+        return _quotients(weight, np.array(every))
 
-    met = {i for pair, is_so in zip(pairs, sharp, strict=True) if is_so for i in pair}
-    complete, of_edges = [], []
-    for i, body in enumerate(bodies):
-        given = usual if body.material is None else body.material
-        size = min(body.size, largest)
-        complete.append(law.complete(given, Setting(size, strength, rule(i), timestep, False)))
-        there = complete[-1]
-        if i in met:
-            there = law.complete(given, Setting(size, strength, rule(i), timestep, True))
-        of_edges.append(OfEdges(there.stiffness, there.impact_depth))
-    found, there = (jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (complete, of_edges))
-    return found, there
+    every = functools.partial(stiffness, set(touching))
+    setting = Setting(sizes, strength, every, timestep, False)
+    found = _of_bodies(bodies, law, usual, setting)
+    met = {i for i in touching if flat[i]}
+    if len(met) < 2:
+        return found, OfEdges(found.stiffness, found.impact_depth)
+    setting = setting._replace(stiffness=functools.partial(stiffness, met), sharp=True)
+    there = _of_bodies(bodies, law, usual, setting)
+    return found, OfEdges(
+        *(_where(flat, getattr(there, name), getattr(found, name)) for name in OfEdges._fields)
+    )
+
+
+def _of_bodies(
+    bodies: Sequence[Body], law: DistributedLaw, usual: ContactParams, setting: Setting
+) -> ContactParams:
+    """Complete parameters of all bodies as arrays."""
+    given = [usual if body.material is None else body.material for body in bodies]
+    some = next((params for params in given if params.stiffness is None), given[0])
+    defaults = law.defaults(some, setting)
+    columns = [[getattr(params, name) for params in given] for name in law.reads]
+    arrays = _filled_columns(columns, [defaults.get(name, 0.0) for name in law.reads], setting.timestep)
+    empty = ContactParams()
+    places = lambda params: [getattr(params, name) for name in law.reads]  # noqa: E731
+    return eqx.tree_at(places, empty, arrays, is_leaf=lambda x: x is None)
+
+
+@by_numpy
+def _filled_columns(columns: list[list[Any]], defaults: list[Any], like: AnyArray) -> list[AnyArray]:
+    """Arrays over bodies: of numbers that are given, and else of defaults, one for all or one each."""
+    arrays = []
+    for given, default in zip(columns, defaults, strict=True):
+        n = len(given)
+        xp = library(default, *(x for x in given if x is not None))
+        every = xp.broadcast_to(xp.asarray(default), (n,))
+        if any(x is not None for x in given):
+            rows = [every[i] if x is None else x for i, x in enumerate(given)]
+            # The type of numbers that are given is kept, as a body's alone would be.
+            every = xp.stack(rows)
+        arrays.append(every.astype(like.dtype))
+    return arrays
+
+
+@by_numpy
+def _where(which: Sequence[bool], x: Float[Q, " n"], y: Float[Q, " n"]) -> Float[AnyArray, " n"]:
+    return library(x, y).where(np.array(which), x, y)
+
+
+@by_numpy
+def _quotients(weight: Float[Q, ""], supports: Float[np.ndarray, " n"]) -> Float[AnyArray, " n"]:
+    return weight / supports.astype(weight.dtype)

@@ -7,7 +7,7 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from dano.checks import checked_items, checked_kind, checked_optional, shown
 from dano.contact import checked_parameter, ContactParams, Distance, distance
@@ -38,6 +38,7 @@ from dano.scene._making import (
     check_materials,
     check_names,
     room_for,
+    sampled_alike,
     structure,
     twins_of,
     warn_of_limits,
@@ -64,6 +65,8 @@ class Scene(eqx.Module):
         others: Pairs of bodies that no contact names; None if they do not touch.
         room: Chunks of point contacts that a step has room for (static); None leaves it to the engine.
         loops: What closes chains of joints.
+        sampled: For each body the first with the same samples of its surface, which stand once in memory, as
+            shapes with the same numbers have them (static).
     """
 
     bodies: tuple[Body, ...]
@@ -75,6 +78,7 @@ class Scene(eqx.Module):
     others: Others | None = None
     room: int | None = eqx.field(static=True, default=None)
     loops: tuple[Loop, ...] = ()
+    sampled: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def create(
@@ -135,7 +139,8 @@ class Scene(eqx.Module):
         if contacts or rest is not None:
             warn_of_long_steps(bodies, timestep, gravity)
         room = room_for(bodies, timestep, gravity)
-        scene = cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops)
+        sampled = sampled_alike(bodies, twins)
+        scene = cls(bodies, contacts, timestep, gravity, twins, joints, rest, room, loops, sampled)
         say_doubts(doubts_of_scene(bodies, joints, contacts, gravity, scene._meeting), stacklevel=2)
         return scene
 
@@ -210,11 +215,12 @@ class Scene(eqx.Module):
         return tuple(body.name for body in self.bodies)
 
     @property
-    def point_pairs(self) -> tuple[tuple[int, int], ...]:
+    def point_pairs(self) -> Int[np.ndarray, "k 2"]:
         """Indices of the bodies of each contact with a point law, then of the other pairs that may touch."""
         place = {name: i for i, name in enumerate(self.names)}
-        named = tuple((place[c.a], place[c.b]) for c in self.contacts if c.law.presses)
-        return named if self.others is None else (*named, *self.others.pairs)
+        named = [(place[c.a], place[c.b]) for c in self.contacts if c.law.presses]
+        rest = [] if self.others is None else self.others.pairs.array
+        return np.concatenate([np.array(named, int).reshape(-1, 2), np.reshape(rest, (-1, 2))]).astype(int)
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
@@ -227,7 +233,11 @@ class Scene(eqx.Module):
     @property
     def _meeting(self) -> set[str]:
         """Names of the bodies that may touch something."""
-        return {name for pair in self.pairs for name in pair}
+        named = {name for contact in self.contacts for name in (contact.a, contact.b)}
+        if self.others is None:
+            return named
+        names = self.names
+        return named | {names[i] for i in np.unique(self.others.pairs.array).tolist()}
 
     def index(self, name: str) -> int:
         """Index of a body.
@@ -439,7 +449,8 @@ class Scene(eqx.Module):
         if given is not None:
             placed = {name for name, numbers in given.items() if {"position", "origin", "q"} & set(numbers)}
         moved = {i for i, body in enumerate(self.bodies) if not body.fixed and body.name in placed}
-        pairs = [pair for pair in self.point_pairs if moved & set(pair)]
+        pairs = self.point_pairs
+        pairs = pairs[np.isin(pairs, list(moved)).any(axis=1)]
         return doubts_of_state(self.bodies, pairs, self.layout, state, float(self.timestep))
 
     def filled(self, state: State) -> State:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dano.archive import write_text
+from dano.archive import write_json, write_text
 from dano.cli import _scenes
 from dano.cli._arguments import Simulate, Train
 from dano.cli._console import say
@@ -49,10 +49,10 @@ def stages_after(place: Place) -> list[Stage]:
             {
                 "walk": place.photographs,
                 "masks": place.given,
-                "masked photographs": [folder / "masked.json", folder / "masks"],
+                "masked photographs": [folder / "masked.json", folder / "masks", folder / "doubts"],
             },
             learned,
-            [output],
+            [output, folder / "object.json"],
             lambda goes_on: _learn(place, goes_on),
             f"Look at {folder / 'masks.png'}: outlines must be those of the object. {AGAIN}",
         ),
@@ -61,7 +61,7 @@ def stages_after(place: Place) -> list[Stage]:
             "where the object is in each frame of the film (`dano track`)",
             filmed,
             taken,
-            [motion, folder / "motion.html"],
+            [motion, folder / "motion.json", folder / "motion.html"],
             lambda _: _follow(place),
             "Give a picture of the place without the object (--background), and look whether the object is"
             f" learned well: {output.with_suffix('.html')}. {AGAIN}",
@@ -101,6 +101,7 @@ def _learn(place: Place, goes_on: bool) -> None:
             table=0.0,
             seed=asked.seed,
             resume=goes_on,
+            json=place.folder / "object.json",
         )
     )
 
@@ -108,7 +109,7 @@ def _learn(place: Place, goes_on: bool) -> None:
 def _follow(place: Place) -> None:
     """A pose in every frame."""
     asked, folder = place.command, place.folder
-    track(
+    numbers = track(
         Track(
             asked.slide,
             str(asked.output),
@@ -118,6 +119,7 @@ def _follow(place: Place) -> None:
             filming=place.filming(),
         )
     )
+    write_json(folder / "motion.json", {name: numbers[name] for name in ("quality", "frames", "tracked")})
 
 
 def _fit(place: Place) -> None:

@@ -42,6 +42,7 @@ class Film:
         frames: Most frames of a walk that is a film.
         first: Begin with this stage; what comes before is taken as it is, the others are made again.
         last: Stop after this stage.
+        force: Go on after a stage whose number says that the rest would be vain.
         seed: Seed of all random numbers.
         json: Print one JSON object instead of text.
     """
@@ -64,5 +65,6 @@ class Film:
     frames: int = 80
     first: Annotated[StageName | None, arg(name="from")] = None
     last: Annotated[StageName | None, arg(name="to")] = None
+    force: bool = False
     seed: int = 0
     json: bool = False

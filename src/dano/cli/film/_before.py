@@ -48,7 +48,7 @@ def stages_before(place: Place) -> list[Stage]:
             "what in the photographs is the object, and whether all fits together (`dano data`)",
             {**walk, **network, "cameras": [photographs]},
             {},
-            [folder / "masked.json", folder / "masks.png"],
+            [folder / "masked.json", folder / "fit.json", folder / "masks.png"],
             lambda _: _masks(place),
             f"Give masks (--masks) or a segmentation network (--network). {AGAIN}",
         ),
@@ -131,7 +131,13 @@ def _masks(place: Place) -> None:
             file = masks / f"{Path(row['file_path']).stem}.png"
             _write_mask(file, view.mask)
             row["mask_path"] = f"{masks.name}/{file.name}"
+            if view.doubt is not None:
+                doubted = folder / "doubts" / file.name
+                doubted.parent.mkdir(exist_ok=True)
+                _write_mask(doubted, view.doubt)
+                row["doubt_path"] = f"doubts/{file.name}"
     print_data(report)
+    write_json(folder / "fit.json", {name: report[name] for name in ("masks", "residual", "warnings")})
     write_json(folder / "masked.json", content)
 
 

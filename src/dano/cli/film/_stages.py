@@ -39,6 +39,8 @@ class Stage:
         outputs: Files that it writes, all of which are there when it has ended.
         make: Does it. Told whether to go on with what was interrupted, with the same inputs.
         advice: What to do if it fails.
+        judge: Asked when it has ended, for a line about how good its results are, and whether to go on; None:
+            nothing is said.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Stage:
     outputs: Sequence[Path]
     make: Callable[[bool], object]
     advice: str
+    judge: Callable[[], tuple[str, bool]] | None = None
 
     def inputs(self) -> Inputs:
         """Fingerprints of all that it is made of."""
@@ -66,6 +69,7 @@ def run_stages(
     *,
     first: str | None = None,
     last: str | None = None,
+    force: bool = False,
     tell: Callable[[str], None],
     clock: Callable[[], float] = time.monotonic,
 ) -> list[str]:
@@ -77,6 +81,7 @@ def run_stages(
         first: Begin with this one: what comes before is taken as it is, this one and those after it are made
             again. None: make what is not there, or is of other inputs.
         last: Stop after this one; None: after all.
+        force: Go on after a stage of which `judge` says not to.
         tell: Told in a line what becomes of each stage.
         clock: Gives the time [s].
 
@@ -85,7 +90,8 @@ def run_stages(
 
     Raises:
         ValueError: If `first` or `last` is not a stage, they are in the wrong order, something before `first`
-            is not there, or a stage fails; the message names the stage and says what to do.
+            is not there, a stage fails, or its results are too bad to go on; the message names the stage and
+            says what to do.
     """
     begin, end = chosen(stages, first, last)
     known, made = _read(record), []
@@ -99,6 +105,7 @@ def run_stages(
         if first is None and _is_done(stage, before, inputs):
             assert before is not None
             tell(f"{label}: taken up again, it took {duration(before['seconds'])} and nothing has changed")
+            _judge(stage, label, force or number == end, tell)
             continue
         tell(f"{label}: {stage.what}{_because(stage, before, inputs)}")
         goes_on = before is not None and before["seconds"] is None and before["inputs"] == inputs
@@ -109,7 +116,24 @@ def run_stages(
         _write(record, known, stage.name, inputs, seconds)
         tell(f"{label}: done in {duration(seconds)}")
         made.append(stage.name)
+        _judge(stage, label, force or number == end, tell)
     return made
+
+
+def _judge(stage: Stage, label: str, goes_on: bool, tell: Callable[[str], None]) -> None:
+    """Say how good the results of a stage are.
+
+    Raises:
+        ValueError: If they are too bad to go on, unless that is wished.
+    """
+    if stage.judge is None:
+        return
+    text, good = stage.judge()
+    tell(f"{label}: {text}")
+    if not good and not goes_on:
+        raise ValueError(
+            f"stage {stage.name}: {text}, what follows would be wrong. {stage.advice}; --force goes on anyway"
+        )
 
 
 def chosen(stages: Sequence[Stage], first: str | None, last: str | None) -> tuple[int, int]:

@@ -7,7 +7,16 @@ import numpy as np
 from dano.cli.tracking._arguments import Filming
 from dano.progress import Progress
 from dano.scene_file import asset_look
-from dano.vision import Camera, Film, LearnedField, load_camera, PosedCamera, read_film, TrackOptions
+from dano.vision import (
+    Camera,
+    Film,
+    LearnedField,
+    load_camera,
+    PosedCamera,
+    read_film,
+    steady_film,
+    TrackOptions,
+)
 
 
 def check_camera(filming: Filming) -> None:
@@ -24,8 +33,8 @@ def check_camera(filming: Filming) -> None:
 
 
 def filmed(filming: Filming, video: Path, rate: float | None, progress: Progress) -> Film:
-    """The frames of a video or a folder."""
-    return read_film(
+    """The frames of a video or a folder, as if the camera had kept the direction of the first one."""
+    film = read_film(
         video,
         rate=rate,
         slow_motion=filming.slow_motion,
@@ -36,6 +45,7 @@ def filmed(filming: Filming, video: Path, rate: float | None, progress: Progress
         occluders=filming.occluders,
         progress=progress,
     )
+    return steady_film(film, camera_of(filming, film), filming.background, filming.readout)
 
 
 def options_of(filming: Filming) -> TrackOptions:

@@ -13,8 +13,8 @@ from dano.identification import Motion, save_motion
 from dano.vision import track as find_poses, Tracked
 
 
-def track(command: Track) -> None:
-    """See `dano track --help`."""
+def track(command: Track) -> dict[str, Any]:
+    """See `dano track --help`; what it prints, in numbers."""
     check_output(command.output, command.video, suffix=".npz")
     if command.report is not None:
         check_output(command.report, command.video, suffix=".html")
@@ -47,8 +47,9 @@ def track(command: Track) -> None:
     numbers = _numbers(command, found)
     if command.json:
         put_json(numbers)
-        return
-    _print(numbers, command)
+    else:
+        _print(numbers, command)
+    return numbers
 
 
 def _numbers(command: Track, found: Tracked) -> dict[str, Any]:

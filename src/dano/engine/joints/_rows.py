@@ -2,11 +2,11 @@
 
 from collections.abc import Iterable
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from dano.engine.joints._structure import tree_structure, TreeStructure
+from dano.maths import AnyArray, library
 from dano.scene import JointLaws, Scene
 
 _SIX = 6
@@ -29,12 +29,13 @@ def structure_of_trees(scene: Scene, touching: Iterable[int]) -> TreeStructure:
 
 def tree_rows(
     scene: Scene, structure: TreeStructure
-) -> tuple[dict[str, Float[Array, "rows width"]], dict[str, Int[np.ndarray, "..."]]]:
+) -> tuple[dict[str, Float[AnyArray, "rows width"]], dict[str, Int[np.ndarray, "..."]]]:
     """Real and whole numbers by place in a kernel's parameters."""
     dtype, closing = scene.timestep.dtype, scene.closing
-    loops = jnp.zeros((0, 10), dtype)
+    loops = np.zeros((0, 10), dtype)
     if closing is not None:
-        loops = jnp.concatenate([closing.position, closing.anchor, closing.orientation], axis=1)
+        of_loops = (closing.position, closing.anchor, closing.orientation)
+        loops = library(*of_loops).concatenate(of_loops, axis=1)
     rows = {
         "scene.trees.joints": scene.chains.table.astype(dtype),
         "scene.trees.laws": _law_rows(scene.chains.laws, dtype),
@@ -72,21 +73,23 @@ def tree_lengths(structure: TreeStructure) -> dict[str, int]:
     return {f"room.trees.{name}": length for name, length in lengths.items()}
 
 
-def _law_rows(laws: JointLaws, dtype) -> Float[Array, "c 12"]:
+def _law_rows(laws: JointLaws, dtype) -> Float[AnyArray, "c 12"]:
     """What acts on each joint coordinate, see `JointLaws`.
 
     Damping, armature, stiffness, rest, friction, two limits and five numbers of a motor. What no joint has is
     0, or endless.
     """
-    none = jnp.zeros_like(laws.damping)
+    none = np.zeros(laws.damping.shape, laws.damping.dtype)
 
-    def column(values: Array | None) -> Array:
+    def column(values: AnyArray | None) -> AnyArray:
         return (none if values is None else values)[:, None]
 
     endless = np.broadcast_to(np.array([-np.inf, np.inf]), (none.size, 2))
-    limits = jnp.asarray(endless, dtype) if laws.limits is None else laws.limits
+    endless = endless.astype(dtype)
+    limits = endless if laws.limits is None else laws.limits
     motor = laws.motor
     if motor is None:
-        motor = jnp.concatenate([jnp.zeros((none.size, 3), dtype), jnp.asarray(endless, dtype)], axis=1)
+        motor = np.concatenate([np.zeros((none.size, 3), dtype), endless], axis=1)
     single = (laws.damping, laws.armature, laws.stiffness, laws.rest, laws.friction)
-    return jnp.concatenate([*(column(x) for x in single), limits, motor], axis=1)
+    columns = [*(column(x) for x in single), limits, motor]
+    return library(*columns).concatenate(columns, axis=1)

@@ -18,8 +18,8 @@ from dano.physics.point_law import (
     is_apart,
     Linear,
     linearized,
-    Motion,
     point_motion,
+    slip_of,
 )
 from dano.physics.real import mat33, mat36, mat66, ONE, real, vec3, vec6, ZERO
 from dano.physics.samples import Point
@@ -132,13 +132,6 @@ def pair_twist(
 
 
 @wp.func
-def slip_of(point: Point, motion: Motion) -> Motion:
-    """Motion with the extra slip of a point."""
-    motion.slip = motion.slip + point.extra_slip
-    return motion
-
-
-@wp.func
 def fit_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, island: int):
     """Duals of an island that fit the accepted velocities."""
     for f in range(n_found):
@@ -153,8 +146,9 @@ def fit_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n
             room.marks[world, k] = 0
             if not is_apart(room.gates[world, k], twist.velocity, twist.spin):
                 point = room.points[world, k]
-                motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
-                room.duals[world, k] = fitting_duals(room.laws[world, k], motion)
+                law = room.laws[world, k]
+                motion = slip_of(law, point_motion(point, twist.velocity, twist.spin))
+                room.duals[world, k] = fitting_duals(law, motion)
                 room.marks[world, k] = _KNOWN
 
 
@@ -365,7 +359,7 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
             else:
                 point = room.points[world, k]
                 law = room.laws[world, k]
-                motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
+                motion = slip_of(law, point_motion(point, twist.velocity, twist.spin))
                 duals = room.duals[world, k]
                 changes = room.changes[world, k]
                 duals.friction = duals.friction + trial.length * changes.friction

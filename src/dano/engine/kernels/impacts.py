@@ -13,7 +13,7 @@ from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.physics.features import LANES, TREES
 from dano.physics.momentum import turned_inertia
 from dano.physics.pairs import FIXED, rotation_met
-from dano.physics.real import mat66, ONE, real, vec6, ZERO
+from dano.physics.real import HALF, mat66, ONE, real, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, wrench_at
 
 _LANES, _FIXED = wp.constant(LANES), wp.constant(FIXED)
@@ -70,12 +70,42 @@ def meetings_of(
 
 
 @wp.func
+def support_before(found: FoundPair) -> vec6:
+    """Impulse of what a pair rests on, from the middle of the step before to when it meets."""
+    return (found.impact.part * found.impact.delays * (HALF + found.share)) * found.support
+
+
+@wp.func
+def support_delayed(found: FoundPair) -> vec6:
+    """Impulse by which positions change less than velocities do, of what a pair rests on until it meets."""
+    share = found.share
+    return (found.impact.part * found.impact.delays * HALF * share * share) * found.support
+
+
+@wp.func
+def push_pair_of(
+    scene: wp.ref[Scene], to: wp.array2d(dtype=vec6), world: int, found: FoundPair, impulse: vec6
+):
+    """Add an impulse on the first body of a pair to its bodies' momenta."""
+    index = scene.pair_index[found.pair]
+    a = scene.body_index[index.first].row
+    b = scene.body_index[index.second].row
+    if a >= 0:
+        to[world, a] += impulse
+    if b >= 0:
+        to[world, b] -= wrench_at(impulse, found.com_difference)
+
+
+@wp.func
 def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int):
-    """Balance angular momenta where bodies meet: with the inertia that they have then.
+    """Add what bodies rest on until they meet, and balance angular momenta there, with their inertia then.
 
     Of impulses that take effect at several moments the mean counts. Everything is right to first order in h
     for any of them.
     """
+    for f in range(n_found):
+        found = room.found[world, f * _LANES]
+        push_pair_of(scene, room.momentum, world, found, support_before(found))
     for i in range(scene.moving.shape[0]):
         body = scene.moving[i]
         count, waits, shares = meetings_of(scene, room, world, n_found, body)
@@ -105,6 +135,7 @@ def find_moved(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, 
             found = room.found[world, f * _LANES + lane]
             if found.impact.delays > ZERO:
                 impulse = (found.impact.delays * found.share) * pair_impulse(scene, room, world, found)
+                impulse += support_delayed(found)
                 if lane == 0:
                     index = scene.pair_index[found.pair]
                     a = scene.body_index[index.first].row

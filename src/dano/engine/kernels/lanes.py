@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from dano.physics.features import LANES
-from dano.physics.real import INFINITY, mat33, mat66, real, vec3, vec4, vec6
+from dano.physics.real import INFINITY, mat33, mat66, quat, real, vec3, vec4, vec6
 from dano.physics.structures import plain_fields, written
 
 # Beyond all indices.
@@ -80,7 +80,22 @@ def total66(x: mat66) -> mat66:
     return x
 
 
-_TOTALS = {real: "total", vec3: "total3", vec4: "total4", mat33: "total33", vec6: "total6", mat66: "total66"}
+@wp.func
+def total_quat(x: quat) -> quat:
+    """Sum over the lanes of a world."""
+    sums = total4(vec4(x[0], x[1], x[2], x[3]))
+    return quat(sums[0], sums[1], sums[2], sums[3])
+
+
+_TOTALS = {
+    real: "total",
+    vec3: "total3",
+    vec4: "total4",
+    quat: "total_quat",
+    mat33: "total33",
+    vec6: "total6",
+    mat66: "total66",
+}
 
 
 def total_of(structure: Any) -> Any:

@@ -7,7 +7,7 @@ from dano.engine.kernels.rollout import begin_unpushed, Launch
 from dano.engine.kernels.search import find_contacts
 from dano.engine.kernels.tables import Room, Scene
 from dano.physics.features import LANES
-from dano.physics.impacts import fading_in
+from dano.physics.impacts import fading_in, is_hit
 from dano.physics.real import real
 from dano.physics.samples import Point
 
@@ -83,7 +83,9 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
             row.share = found.share
             row.impact_share = found.impact.share
             row.point = room.points[world, k]
+            bounce = scene.materials[world, index.contact].bounce
             weight = fading_in(row.point.sunk / found.impact.depth)
+            weight *= is_hit(row.point.approach, bounce, found.impact.rests)
             row.impact_stiffness = weight * found.impact.part * found.impact.stiffness
             at = shift + k - lane * per_lane
             if at < listing.points.shape[1]:

@@ -2,15 +2,17 @@
 
 import warp as wp
 
-from dano.engine.kernels.tables import BLOCK, Body, Room, RUN, Scene
-from dano.physics.features import LANES
-from dano.physics.pairs import BodyState, facing_direction, pair_pose, PairPose
+from dano.engine.kernels.tables import BLOCK, Body, FoundPair, Room, RUN, Scene
+from dano.physics.features import LANES, TREES
+from dano.physics.impacts import share_left_out, supported
+from dano.physics.pairs import BodyState, facing_direction, falling, pair_pose, PairPose
 from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.samples import solid_normal
 from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
 from dano.physics.solids.grids import STEEPEST
 from dano.physics.solids.kinds import HALF_SPACE
+from dano.physics.twists import wrench_at
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 _HALF_SPACE = wp.constant(HALF_SPACE)
@@ -114,6 +116,26 @@ def is_near(
     reach += other.radius + h * wp.length(b.spin) * wp.length(other.middle - other.com)
     apart = x - middle_of(other, b)
     return wp.dot(apart, apart) <= reach * reach
+
+
+@wp.func
+def left_out(found: FoundPair, factor: real) -> real:
+    """`share_left_out` of a pair, none where it rests on nothing while it nears an impact."""
+    if wp.length_sq(found.support) > ZERO:
+        return share_left_out(found.rest, factor)
+    return ZERO
+
+
+@wp.func
+def as_they_meet(a: BodyState, b: BodyState, found: FoundPair, h: real) -> tuple[BodyState, BodyState]:
+    """Bodies of a pair with what their velocities gain until they meet: by gravity, and what they rest on."""
+    first = falling(a, found.falls)
+    second = falling(b, found.falls)
+    if wp.static(not TREES):
+        if wp.length_sq(found.support) > ZERO:
+            first = supported(first, found.support, h)
+            second = supported(second, -wrench_at(found.support, found.com_difference), h)
+    return first, second
 
 
 @wp.func

@@ -135,7 +135,9 @@ def begin_body(
             state.spin = spin
             if wp.static(not TREES):
                 state.gain = h * scene.gravity[world, 0]
+                state.falls = state.gain
                 state.spin_gain = gyroscopic_gain(spin, inertia, state.inverse_inertia, h)
+                state.lag = (HALF * h) * state.spin_gain
                 falls = row.omega + wp.transpose(rotation) * state.spin_gain
                 state.ahead_falling = turned(state.orientation, falls, h)
         linear = body.mass * (row.velocity + h * scene.gravity[world, 0]) + h * push.force

@@ -9,8 +9,10 @@ import warp as wp
 from dano.engine.kernels.lanes import lanes_where, total, total3
 from dano.engine.kernels.meeting import Meeting, meeting
 from dano.engine.kernels.near import (
+    as_they_meet,
     facing,
     is_near,
+    left_out,
     plane_of,
     posed,
     reach_of_block,
@@ -29,12 +31,18 @@ from dano.engine.kernels.tables import (
 from dano.physics.features import LANES, TREES
 from dano.physics.impacts import (
     delayed,
+    depth_beside,
+    fall_of,
     Impact,
     no_impact,
     Patch,
     patch_of_sample,
+    Rest,
+    rest_of_sample,
     share_of_impact,
     stiffness_of_impact,
+    support_of,
+    turning_after,
 )
 from dano.physics.pairs import (
     BodyState,
@@ -43,7 +51,7 @@ from dano.physics.pairs import (
     speed_within,
 )
 from dano.physics.point_law import gate_of, Material, point_law
-from dano.physics.real import HALF, ONE, real, TWO, vec3, ZERO
+from dano.physics.real import HALF, ONE, real, TWO, vec3, vec6, ZERO
 from dano.physics.samples import (
     facing_area,
     is_turned,
@@ -124,6 +132,8 @@ def find_points(
     entry: int,
     share: real,
     h: real,
+    bounce: real,
+    rests: real,
     turned: bool,
     begin: int,
     end: int,
@@ -195,8 +205,8 @@ def find_points(
                             if in_patch:
                                 load += point.area * wp.max(point.sunk, ZERO)
                                 own = patch_of_sample(
-                                    point.area, point.sunk, pair.impact_depth, point.approach, point.arm,
-                                    point.normal,
+                                    point.area, point.sunk, pair.impact_depth, point.approach, bounce,
+                                    rests, point.arm, point.normal,
                                 )  # fmt: skip
                                 patch.load += own.load
                                 patch.arm += own.arm
@@ -217,6 +227,7 @@ def impact_of(
     material: Material,
     found: FoundPair,
     pair: SamplePair,
+    turning: int,
     alone: bool,
 ) -> Impact:
     """The impact of a pair; none where it approaches slowly.
@@ -228,6 +239,7 @@ def impact_of(
         material: Of the contact.
         found: What is found of the pair.
         pair: The pair.
+        turning: How samples turn with the first body.
         alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
             they meet; between two that move, this would not conserve angular momentum.
     """
@@ -240,7 +252,51 @@ def impact_of(
             )
             delays = wp.where(alone, impact.share, ZERO)
             impact = delayed(impact, delays, found.share, material.timestep)
+            impact.rests = left_out(found, pair.factor)
+            if alone:
+                impact.turns = turning_after(a, b, patch, material.friction, found.share, turning)
     return impact
+
+
+@wp.func
+def find_rest(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, a: BodyState, b: BodyState, p: int
+) -> Rest:
+    """What a pair rests on when the step begins."""
+    rest = Rest()
+    index = scene.pair_index[p]
+    pair = scene.pairs[world, p]
+    samples = scene.body_index[index.first]
+    bounce = scene.materials[world, index.contact].bounce
+    solid = solid_of_body(scene, world, index.second)
+    h = scene.timestep[world, 0]
+    pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
+    stretch = stretch_of(scene.bodies[world, index.first], samples.turning)
+    plane = plane_of(scene, world, solid, samples.turning, pose.origin)
+    fall = fall_of(a, b, pair.impact_depth, h)
+    for i in range(lane, samples.blocks, _LANES):
+        block = samples.first_block + i
+        ball = scene.balls[world, block]
+        x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
+        far = fall + reach_of_block(scene, world, pose, plane, block, stretch)
+        if solid_clearance(scene.solids, world, solid, x, far) <= far:
+            for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
+                sample = scene.samples[world, s]
+                d = solid_distance(scene.solids, world, solid, position_in_solid(pose, sample.point))
+                if d.value < fall and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
+                    point = point_contact(pose, sample, d, samples.turning, False, pair.share, ZERO)
+                    own = rest_of_sample(point.depth, fall, point.approach, bounce, point.arm, point.normal)
+                    rest.load += own.load
+                    rest.near += own.near
+                    rest.depth += own.depth
+                    rest.arm += own.arm
+                    rest.normal += own.normal
+    rest.load = total(rest.load)
+    rest.near = total(rest.near)
+    rest.depth = total(rest.depth)
+    rest.arm = total3(rest.arm)
+    rest.normal = total3(rest.normal)
+    return rest
 
 
 @wp.func
@@ -339,6 +395,8 @@ def find_pair(
     found = FoundPair()
     found.pair = p
     found.first = at
+    found.com_difference = a.position - b.position
+    turning = scene.body_index[index.first].turning
     # Slower than this nothing has an impact.
     slow = h * material.bounce
     sink = wp.max(pair.sink, pair.impact_depth)
@@ -353,21 +411,37 @@ def find_pair(
         lasts = met.slow
     if lasts:
         met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
+    if wp.static(not TREES):
+        if alone and not lasts and met.share < ONE and met.nears:
+            # What it rests on goes on to press until it meets, and says when that is.
+            found.rest = find_rest(scene, room, world, lane, a, b, p)
+            if found.rest.load > ZERO:
+                found.falls = 1
+                seen = falling(a, 1)
+                other = falling(b, 1)
+                found.support = support_of(seen, other, found.rest, material.friction, h, turning)
+                seen, other = as_they_meet(a, b, found, h)
+                met = meeting(
+                    scene, room, world, lane, seen, other, pair, index.first, index.second, h,
+                    depth_beside(found.rest, pair.impact_depth), slow, slow, -ONE,
+                )  # fmt: skip
     after = at
     again = bool(True)
     while again:
         again = False
         found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
         found.falls = wp.where(not lasts and met.nears, 1, 0)
+        if found.falls == 0:
+            found.support = vec6()
         found.critical = met.critical
         found.share = met.share
-        seen = falling(a, found.falls)
-        other = falling(b, found.falls)
+        rests = left_out(found, pair.factor)
+        seen, other = as_they_meet(a, b, found, h)
         pose = posed(scene, world, seen, other, index.first, index.second, met.share, h, pair.follows)
         patch = Patch()
         after, patch, load, turned_load = find_points(
             scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
-            False, at, end, patch,
+            material.bounce, rests, False, at, end, patch,
         )  # fmt: skip
         patch.load = total(patch.load)
         patch.near_load = total(patch.near_load)
@@ -378,13 +452,12 @@ def find_pair(
         if total(turned_load) > total(load):
             after, patch, _load, _turned = find_points(
                 scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
-                True, after, end, patch,
+                material.bounce, rests, True, after, end, patch,
             )  # fmt: skip
         found.patch = patch
-        found.com_difference = pose.com_difference
         found.impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, h)
         if not lasts:
-            found.impact = impact_of(a, b, patch, material, found, pair, alone)
+            found.impact = impact_of(seen, other, patch, material, found, pair, turning, alone)
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share
@@ -393,8 +466,7 @@ def find_pair(
                     scene, room, world, lane, a, b, pair, index.first, index.second, h, sink
                 )
             again = met.share != before or found.falls > 0
-    seen = falling(a, found.falls)
-    other = falling(b, found.falls)
+    seen, other = as_they_meet(a, b, found, h)
     found.toward = facing(scene, world, seen, other, index.first, index.second, found.share, h)
     found.end = wp.min(after, end)
     room.found[world, entry * _LANES + lane] = found

@@ -8,7 +8,7 @@ import warp as wp
 
 from dano.engine.kernels.patch_tables import PatchRoom, PatchSide, PatchTables
 from dano.engine.kernels.trees.tables import TreeRoom, Trees
-from dano.physics.impacts import Impact, Patch
+from dano.physics.impacts import Impact, Patch, Rest
 from dano.physics.overlap import Part, WeightedSample
 from dano.physics.pairs import BodyState
 from dano.physics.patch_law import PatchMaterial
@@ -174,6 +174,10 @@ class FoundPair:
     falls: wp.int32  # 1 where bodies fall freely until they meet: then gravity takes part in their way
     impact: Impact  # Of the pair
     patch: Patch  # Its samples that have sunk in
+    rest: Rest  # Samples that it rests on when the step begins, where it has an impact, too
+    # Impulse in the step of what the pair rests on, while a part of it nears an impact; on the first body, at
+    # its centre of mass [N s, N m s, W].
+    support: vec6
     toward: vec3  # Direction that samples which turn face [F]
     com_difference: vec3  # From the second body's centre of mass to the first's [m, W]
 

@@ -76,17 +76,19 @@ def patch_pairs(scene: Scene) -> list[PatchPair]:
     Raises:
         ValueError: If kernels do not know one of the laws.
     """
+    contacts = [contact for contact in scene.contacts if isinstance(contact.law, AbstractPatchLaw)]
+    if not contacts:
+        return []
     n = len(scene.bodies)
     dtype = scene.timestep.dtype
     unturned = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0], dtype), (n, 1))
     still = State(jnp.zeros((n, 3), dtype), unturned, jnp.zeros((n, 3), dtype), jnp.zeros((n, 3), dtype))
     rotations = [jnp.eye(3, dtype=dtype)] * n
     found = []
-    for contact in scene.contacts:
-        if isinstance(contact.law, AbstractPatchLaw):
-            a, b = colliders(scene.bodies, contact, still, rotations)
-            first, second = scene.index(contact.a), scene.index(contact.b)
-            found.append(PatchPair(first, second, a, b, contact.params, contact.law))
+    for contact in contacts:
+        a, b = colliders(scene.bodies, contact, still, rotations)
+        first, second = scene.index(contact.a), scene.index(contact.b)
+        found.append(PatchPair(first, second, a, b, contact.params, contact.law))
     return found
 
 
@@ -110,6 +112,8 @@ def patch_tables(
     Raises:
         ValueError: If kernels do not know a law or a field, or a pair has nothing to sum over.
     """
+    if not pairs:
+        return PatchTables({}, {}, [], _integers([], 3), False)
     samples, fields = _Samples(dtype, twins), _Fields(dtype, n_leaves, twins)
     contacts, materials, sides, side_index, index = [], [], [], [], []
     for k, pair in enumerate(pairs):
@@ -121,8 +125,8 @@ def patch_tables(
         side_index += [row for _, row in own]
         index.append((pair.first, pair.second, k))
     rows = {
-        "scene.patches.materials": jnp.stack(materials) if materials else jnp.zeros((0, 11), dtype),
-        "scene.patches.sides": jnp.stack(sides) if sides else jnp.zeros((0, 5), dtype),
+        "scene.patches.materials": jnp.stack(materials),
+        "scene.patches.sides": jnp.stack(sides),
         **samples.rows(),
         **fields.rows(),
     }

@@ -32,7 +32,7 @@ _POINT = {
     "impact_stiffness": 1,
 }
 _POINT |= {"arm": 3, "normal": 3, "moment": 3, "extra_slip": 3}
-_POINT |= {"depth": 1, "rate": 1, "approach": 1, "meets": 1, "gains_after": 1, "area": 1, "sunk": 1}
+_POINT |= {"depth": 1, "rate": 1, "approach": 1, "meets": 1, "gains_after": 3, "area": 1, "sunk": 1}
 _PATCHES = tuple(
     f"room.patches.{name}"
     for name in ("patches", "arms", "duals", "changes", "linear", "wrenches", "jacobians")

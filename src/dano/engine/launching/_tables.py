@@ -3,14 +3,15 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
-from jaxtyping import Array, DTypeLike, Float, Int
+from jaxtyping import DTypeLike, Float, Int
 
 from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Material, materials, SurfaceSet
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
 from dano.engine.launching._builds import build_for
 from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchTables
+from dano.maths import AnyArray, library
 from dano.native import (
     balls_around_runs,
     Features,
@@ -58,7 +59,7 @@ class Tables(eqx.Module):
         structure: Kinematic trees and loops (static).
     """
 
-    rows: dict[str, Float[Array, "rows width"]]
+    rows: dict[str, Float[AnyArray, "rows width"]]
     whole: Whole = eqx.field(static=True)
     features: Features = eqx.field(static=True)
     structure: TreeStructure = eqx.field(static=True)
@@ -87,7 +88,7 @@ def _own_law(scene: Scene) -> str:
     return files.pop() if files else ""
 
 
-def packed(features: Features, struct: str, **fields: Array) -> Float[Array, "rows width"]:
+def packed(features: Features, struct: str, **fields: AnyArray) -> Float[AnyArray, "rows width"]:
     """Rows of a structure of `dano.engine.kernels.tables`, from arrays of its fields with an axis of rows.
 
     Raises:
@@ -97,7 +98,12 @@ def packed(features: Features, struct: str, **fields: Array) -> Float[Array, "ro
     if set(names) != set(fields):
         raise ValueError(f"fields must be {names}, got {list(fields)}")
     n = fields[names[0]].shape[0]
-    return jnp.concatenate([fields[name].reshape(n, -1) for name in names], axis=1)
+    return library(*fields.values()).concatenate([fields[name].reshape(n, -1) for name in names], axis=1)
+
+
+def _column(rows: Sequence[AnyArray], dtype: DTypeLike) -> AnyArray:
+    """Arrays as the rows of one."""
+    return library(*rows).stack(rows).astype(dtype)
 
 
 def scene_tables(scene: Scene) -> Tables:
@@ -114,9 +120,9 @@ def scene_tables(scene: Scene) -> Tables:
                 f"kernels know, got {type(contact.law).__name__}"
             )
     pairs = pressing_pairs(scene.bodies, scene.point_pairs)
-    used = {i for pair in pairs for i in pair[:2]}
+    used = set(np.unique(pairs[:, :2]).tolist())
     bodies = [body if i in used else body.unused() for i, body in enumerate(scene.bodies)]
-    solids, solid_index = _solids(scene, {second for _, second, _ in pairs}, dtype)
+    solids, solid_index = _solids(scene, set(np.unique(pairs[:, 1]).tolist()), dtype)
     patches = _patches(scene, len(pairs), len(solids))
     leaves = [*solids, *patches.leaves]
     unions = patches.unions or any(count > 1 for _, count in solid_index)
@@ -132,21 +138,19 @@ def scene_tables(scene: Scene) -> Tables:
     touching = used | {int(i) for row in patches.pair_index for i in row[:2]}
     structure = structure_of_trees(scene, touching)
     index = [[row, *surface_index[i], *solid_index[i]] for i, row in enumerate(structure.rows)]
-    extents = jnp.stack([_extent(body) for body in bodies]).astype(dtype)
-    com = jnp.stack([body.centre_of_mass for body in bodies]).astype(dtype)
-    mass = jnp.stack([body.mass * body.mass_scale for body in bodies]).astype(dtype)
-    inertia = jnp.stack([body.inertia * body.mass_scale for body in bodies]).astype(dtype)
+    extents = _column([_extent(body) for body in bodies], dtype)
     body_rows = packed(
         features,
         "Body",
-        mass=mass,
-        inertia=inertia,
-        com=com,
-        scale=jnp.stack([body.scale for body in bodies]).astype(dtype),
+        mass=_column([body.mass * body.mass_scale for body in bodies], dtype),
+        inertia=_column([body.inertia * body.mass_scale for body in bodies], dtype),
+        com=_column([body.centre_of_mass for body in bodies], dtype),
+        scale=_column([body.scale for body in bodies], dtype),
         middle=extents[:, :3],
-        radius=jnp.minimum(extents[:, 3], _FAR),
+        radius=library(extents).minimum(extents[:, 3], _FAR),
     )
-    pair_rows, pair_index = _pairs(scene, bodies, pairs, extents, features)
+    groups = _point_laws(scene)
+    pair_rows = _pairs(scene, bodies, groups, pairs, extents, features)
     arrays = {
         "scene.bodies": body_rows,
         **surfaces,
@@ -154,14 +158,14 @@ def scene_tables(scene: Scene) -> Tables:
         "scene.solids.coefficients": of_leaves.coefficients,
         "scene.solids.bounds": of_leaves.bounds,
         "scene.pairs": pair_rows,
-        "scene.materials": _materials(scene, features, dtype),
+        "scene.materials": _materials(groups, scene, features, dtype),
         "scene.gravity": scene.gravity[None].astype(dtype),
         "scene.timestep": scene.timestep[None, None],
     }
     whole = {
         "scene.body_index": np.array(index, np.int32),
         "scene.moving": structure.moving,
-        "scene.pair_index": np.concatenate([pair_index, patches.pair_index]),
+        "scene.pair_index": np.concatenate([pairs.astype(np.int32), patches.pair_index]),
         "scene.solids.kinds": of_leaves.kinds,
     }
     if len(patches.pair_index):
@@ -176,8 +180,8 @@ def scene_tables(scene: Scene) -> Tables:
 _FAR = 1e30
 
 
-def _extent(body: Body) -> Float[Array, "6"]:
-    return jnp.zeros(6) if body.extent is None else body.extent
+def _extent(body: Body) -> Float[AnyArray, "6"]:
+    return np.zeros(6) if body.extent is None else body.extent
 
 
 def _point_laws(scene: Scene) -> list[tuple[DistributedLaw, ContactParams]]:
@@ -188,50 +192,62 @@ def _point_laws(scene: Scene) -> list[tuple[DistributedLaw, ContactParams]]:
     return groups
 
 
-def _impact_depths(scene: Scene, dtype: DTypeLike) -> Float[Array, " contacts"]:
+def _impact_depths(
+    groups: Sequence[tuple[DistributedLaw, ContactParams]], dtype: DTypeLike
+) -> Float[AnyArray, " contacts"]:
     """δ of each contact with a point law [m]."""
-    return jnp.concatenate(
-        [
-            jnp.broadcast_to(params.impact_depth, params.sliding_friction.shape).reshape(-1).astype(dtype)
-            for _, params in _point_laws(scene)
-        ]
-    )
+    every = []
+    for _, params in groups:
+        shape = params.sliding_friction.shape
+        every.append(library(params.impact_depth).broadcast_to(params.impact_depth, shape).reshape(-1))
+    return library(*every).concatenate(every).astype(dtype)
 
 
-def _materials(scene: Scene, features: Features, dtype: DTypeLike) -> Float[Array, "contacts width"]:
-    groups = _point_laws(scene)
+def _strength(scene: Scene) -> Float[AnyArray, ""]:
+    """Of gravity [m/s²]."""
+    xp = library(scene.gravity)
+    return xp.sqrt(xp.sum(scene.gravity**2))
+
+
+def _materials(
+    groups: Sequence[tuple[DistributedLaw, ContactParams]],
+    scene: Scene,
+    features: Features,
+    dtype: DTypeLike,
+) -> Float[AnyArray, "contacts width"]:
     if not groups:
-        return jnp.zeros((0, len(Material._fields)), dtype)
-    gravity = jnp.sqrt(jnp.sum(scene.gravity**2))
-    fields = materials(groups, scene.timestep, gravity)._asdict()
+        return np.zeros((0, len(Material._fields)), dtype)
+    fields = materials(groups, scene.timestep, _strength(scene))._asdict()
     if "numbers" in fields_of(features, _STRUCTURES, "Material"):
-        rows = [jnp.broadcast_to(law.numbers, (p.sliding_friction.size, 3)) for law, p in groups]
-        fields["numbers"] = jnp.concatenate(rows).astype(dtype)
+        xp = library(*(law.numbers for law, _ in groups))
+        rows = [xp.broadcast_to(law.numbers, (p.sliding_friction.size, 3)) for law, p in groups]
+        fields["numbers"] = xp.concatenate(rows).astype(dtype)
     return packed(features, "Material", **fields)
 
 
 def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
     """Samples, and balls around blocks and runs of them, of all bodies; where each body's stand."""
-    twins = scene.twins or tuple(range(len(bodies)))
+    sampled = scene.sampled or scene.twins or tuple(range(len(bodies)))
     empty = SurfaceSet.none(dtype)
     first: dict[int, tuple[int, int]] = {}
     sets: list[SurfaceSet] = []
     index, blocks = [], 0
     for i, body in enumerate(bodies):
         surface = empty if body.surface is None else body.surface
-        key = twins[i] if body.surface is not None else -1 - i
+        key = -1 if body.surface is None else sampled[i]
         if key not in first:
             first[key] = blocks, surface.radii.shape[0]
             sets.append(surface)
             blocks += surface.radii.shape[0]
         index.append((*first[key], _TURNING[surface.turning]))
-    points_of = jnp.concatenate([s.points[:3].T for s in sets]).astype(dtype)
-    vectors = jnp.concatenate([s.vectors.T for s in sets]).astype(dtype)
-    centers = jnp.concatenate([s.centers for s in sets]).astype(dtype)
-    radii = jnp.concatenate([s.radii for s in sets]).astype(dtype)
-    balls = jnp.concatenate([centers, radii[:, None]], axis=1)
+    xp = library(*jax.tree.leaves(sets))
+    points_of = xp.concatenate([s.points[:3].T for s in sets]).astype(dtype)
+    vectors = xp.concatenate([s.vectors.T for s in sets]).astype(dtype)
+    centers = xp.concatenate([s.centers for s in sets]).astype(dtype)
+    radii = xp.concatenate([s.radii for s in sets]).astype(dtype)
+    balls = xp.concatenate([centers, radii[:, None]], axis=1)
     rows = {
-        "scene.samples": jnp.concatenate([points_of, vectors], axis=1),
+        "scene.samples": xp.concatenate([points_of, vectors], axis=1),
         "scene.balls": balls,
         "scene.slabs": slabs_of_blocks(points_of, vectors, centers),
         "scene.runs": balls_around_runs(balls),
@@ -268,29 +284,31 @@ def _patches(scene: Scene, n_pairs: int, n_leaves: int) -> PatchTables:
 def _pairs(
     scene: Scene,
     bodies: Sequence[Body],
-    pairs: Sequence[tuple[int, int, int]],
-    extents: Float[Array, "n 6"],
+    groups: Sequence[tuple[DistributedLaw, ContactParams]],
+    pairs: Int[np.ndarray, "k 3"],
+    extents: Float[AnyArray, "n 6"],
     features: Features,
-):
-    """Rows of the pairs whose first body's samples press on the second's solid, and their whole numbers."""
+) -> Float[AnyArray, "k 7"]:
+    """Rows of the pairs whose first body's samples press on the second's solid."""
     dtype, h = extents.dtype, scene.timestep
-    if not pairs:
-        return jnp.zeros((0, 7), dtype), np.zeros((0, 3), np.int32)
-    both = {(first, second) for first, second, _ in pairs}
-    first, second, contact = (np.array(x) for x in zip(*pairs, strict=True))
-    size, thickness = jnp.minimum(extents[first, 4:], extents[second, 4:]).T
-    smooth = [body.surface is not None and body.surface.turning != "fixed" for body in bodies]
-    gravity_step = jnp.sqrt(jnp.sum(scene.gravity**2)) * h * h
-    depths = _impact_depths(scene, dtype)[contact]
-    rows = packed(
+    if not len(pairs):
+        return np.zeros((0, 7), dtype)
+    first, second, contact = pairs.T
+    # A contact has two rows where both bodies' samples press.
+    share = 1.0 / np.bincount(contact)[contact]
+    smooth = np.array([body.surface is not None and body.surface.turning != "fixed" for body in bodies])
+    xp = library(extents, h, scene.gravity, *jax.tree.leaves(groups))
+    size, thickness = xp.minimum(extents[first, 4:], extents[second, 4:]).T
+    gravity_step = _strength(scene) * h * h
+    depths = _impact_depths(groups, dtype)[contact]
+    return packed(
         features,
         "SamplePair",
-        share=jnp.asarray([0.5 if (j, i) in both else 1.0 for i, j, _ in pairs], dtype),
-        follows=jnp.asarray([float(smooth[j] and not smooth[i]) for i, j, _ in pairs], dtype),
-        sink=jnp.minimum(_SINK * size, _THIN * thickness),
-        impact_depth=jnp.minimum(depths, _THIN * thickness),
-        factor=jnp.clip(0.5 * size / depths, _SOFTEST, _HARDEST),
-        deepest=jnp.minimum(_DEEPEST * size, _THIN * thickness),
+        share=share.astype(dtype),
+        follows=(smooth[second] & ~smooth[first]).astype(dtype),
+        sink=xp.minimum(_SINK * size, _THIN * thickness),
+        impact_depth=xp.minimum(depths, _THIN * thickness),
+        factor=xp.clip(0.5 * size / depths, _SOFTEST, _HARDEST),
+        deepest=xp.minimum(_DEEPEST * size, _THIN * thickness),
         margin=_MARGIN * size + 2 * gravity_step.astype(dtype),
     )
-    return rows, np.array(pairs, np.int32)

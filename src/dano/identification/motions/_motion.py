@@ -38,10 +38,6 @@ JOINT_NUMBERS = 3
 
 # Frames that a local parabola is fitted to for velocities: three on each side.
 SMOOTHING_FRAMES = 7
-# What all poses of a film are off by alike: an offset in sizes and a turn [rad], because nobody photographs
-# what an object stands on, and its distance is as wrong as its size; and a share of its way: a tracker knows
-# sizes to 1.5e-3, and an edge that is seen a tenth of a pixel beside the true one is as much of 100 pixels.
-_BESIDE, _TURNED, _TOO_FAR = 0.01, 6e-3, 2.5e-3
 # Finite differences of a motion and its own angular velocity differ by noise, but not by so large a share.
 _INCONSISTENT = 0.5
 
@@ -182,15 +178,15 @@ class Motion:
 
         Frames of a motion count as independent. Those of a film that was tracked as one motion are not, and
         their covariances are multiplied by how many frames say the same. What all of them are off by alike is
-        that of a learned object and its camera (`alike`).
+        what training says of the learned object (`Doubt`, here `alike`).
         """
         return cls.create(
             tracked.times,
             name,
             position=tracked.position,
             orientation=tracked.orientation,
-            covariance=tracked.covariance * tracked.repeats[:, None, None],
-            alike=(_BESIDE, _TURNED, _TOO_FAR),
+            covariance=tracked.own * tracked.repeats[:, None, None],
+            alike=tracked.doubt,
             point="origin",
         )
 

@@ -9,9 +9,9 @@ import warp as wp
 
 from dano.mujoco.kernels.merging import merge
 from dano.mujoco.kernels.mixing import pair_settings
-from dano.mujoco.kernels.solids import part_clearance, part_distance, quick_clearance
+from dano.mujoco.kernels.solids import distance_with_faces, part_clearance, quick_clearance
 from dano.mujoco.kernels.tables import BLOCK, Data, Known, Model, Options, Part, PartIndex, RUN, Touch, Work
-from dano.mujoco.kernels.words import UNKNOWN
+from dano.mujoco.kernels.words import HULL, UNKNOWN
 from dano.physics.pairs import (
     approach,
     BodyState,
@@ -26,14 +26,17 @@ from dano.physics.rotations import turned
 from dano.physics.samples import facing_area, position_in_solid, solid_normal
 from dano.physics.solids.distances import solid_of
 from dano.physics.solids.grids import STEEPEST
-from dano.physics.solids.kinds import GRID, HALF_SPACE
+from dano.physics.solids.kinds import BOX, GRID, HALF_SPACE
 from dano.physics.solids.leaves import Distance
 
 _BLOCK, _GRID, _HALF_SPACE = wp.constant(BLOCK), wp.constant(GRID), wp.constant(HALF_SPACE)
 _RUN, _UNKNOWN = wp.constant(RUN), wp.constant(UNKNOWN)
+_BOX, _HULL = wp.constant(BOX), wp.constant(HULL)
 # Share of the thinner body's half thickness by which bodies may sink into each other: normals still point
 # out of the side that was hit.
 _SINK = wp.constant(real(0.25))
+# Samples are finer by far if their areas are so much smaller.
+_FINER = wp.constant(real(0.5))
 # Share of its depth with which a sample counts that is near, but does not press.
 _NEAR = wp.constant(real(1e-6))
 # Most steps of the search for the moment when bodies meet, and the share of the step that ends it.
@@ -50,6 +53,9 @@ class Side:
     other: PartIndex  # Of the solid
     a: BodyState  # State of the samples' part
     b: BodyState  # State of the solid's
+    band: real  # Of the other, see `Part`
+    slack: real  # The same
+    coarse: wp.int32  # 1 where the other's samples are finer by far
     sign: real  # 1 if normals out of the solid point from the pair's first part to its second, else −1
 
 
@@ -162,6 +168,47 @@ def next_near_block(
     return found
 
 
+@wp.func(inline=True)
+def pressed_normal(pose: PairPose, solid: int, facing: vec3, normal: vec3, flat: int) -> tuple[vec3, int]:
+    """Outward normal of a solid at a sample: against the face that the sample lies within, if that says more.
+
+    What is round presses on a flat face along the normal of that. Where faces meet, each side takes that of
+    the other. Planes, boxes and hulls of MuJoCo are flat themselves.
+
+    Args:
+        pose: Of the two parts.
+        solid: Kind of the solid.
+        facing: Normal of the face that the sample lies within, zero for none.
+        normal: Of the solid.
+        flat: Whether that is of a flat face of an object.
+
+    Returns:
+        The normal, and 1 if one of the two is that of a flat face of an object, 2 if only the sample's is.
+    """
+    found = normal
+    of_face = int(flat)
+    if wp.dot(facing, facing) > ZERO and flat == 0:
+        against = -(pose.points * facing)
+        if wp.dot(against, normal) > HALF:
+            of_face = 1
+            if solid != _HALF_SPACE and solid != _BOX and solid != _HULL:
+                found = against
+                of_face = 2
+    return found, of_face
+
+
+@wp.func(inline=True)
+def slope_of(own: vec3, normal: vec3) -> vec3:
+    """How the height of a surface over a plane grows along it [1].
+
+    Args:
+        own: Along the outward normal of the surface, towards the plane.
+        normal: Of the plane.
+    """
+    along = wp.dot(own, normal)
+    return (own - along * normal) / wp.max(-along, real(1e-30))
+
+
 @wp.func
 def meeting(known: wp.ref[Known], model: wp.ref[Model], side: Side, sink: real, way: real, h: real) -> real:
     """Share of the step after which the first sample has sunk in by `sink`; 1 if none does within the step.
@@ -178,13 +225,17 @@ def meeting(known: wp.ref[Known], model: wp.ref[Model], side: Side, sink: real, 
         block = int(side.index.first_block)
         end = block + side.index.blocks
         while block < end:
-            block = next_near_block(known, model, side, pose.points, pose.origin, stretch, reach, block, end)
+            block = next_near_block(
+                known, model, side, pose.points, pose.origin, stretch, reach + side.slack, block, end
+            )
             if block < end:
                 for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
                     x = position_in_solid(pose, known.samples[s].point)
-                    d = part_distance(known, model, side.other, x)
+                    d, flat = distance_with_faces(known, model, side.other, side.band, x)
                     if d.value <= reach:
-                        normal = solid_normal(d.gradient)
+                        normal, flat = pressed_normal(
+                            pose, side.other.solid, known.facing[s], solid_normal(d.gradient), flat
+                        )
                         near = h * approach(pose, side.index.turning, x, normal)
                         left = d.value + sink
                         # What begins deeper is no matter of this step.
@@ -263,24 +314,30 @@ def list_side(
     block = int(side.index.first_block)
     last = block + side.index.blocks
     while block < last:
-        block = next_near_block(known, model, side, points, origin, stretch, reach, block, last)
+        block = next_near_block(known, model, side, points, origin, stretch, reach + side.slack, block, last)
         if block < last:
             for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
                 sample = known.samples[s]
                 x = points * sample.point + origin
                 # Most samples of a near block are not near.
                 d = Distance()
+                flat = int(0)
                 if side.other.solid == _GRID:
                     d.value = seen - STEEPEST * wp.length(x - seen_at)
-                if d.value <= reach:
+                if d.value <= reach + side.slack:
                     d.value = quick_clearance(known, side.other, x)
-                if d.value <= reach:
-                    d = part_distance(known, model, side.other, x)
+                if d.value <= reach + side.slack:
+                    d, flat = distance_with_faces(known, model, side.other, side.band, x)
                     seen = d.value
                     seen_at = x
                 if d.value <= reach:
-                    normal = solid_normal(d.gradient)
+                    normal, flat = pressed_normal(
+                        pose, side.other.solid, known.facing[s], solid_normal(d.gradient), flat
+                    )
                     area = facing_area(pose, sample, normal)
+                    # Finer samples say better where what is round presses on a face.
+                    if side.coarse == 1 and flat == 2:
+                        area = ZERO
                     # Samples on the far side of a thin body do not press.
                     if area > ZERO:
                         touch = side_touch(side, pose, share, h, x, normal, d.value)
@@ -295,6 +352,17 @@ def list_side(
                             depth = wp.max(depth, -end)
                         if depth > ZERO:
                             touch.weight = area * depth
+                            touch.area = area
+                            touch.flat = wp.min(flat, 1)
+                            on_face = wp.dot(known.facing[s], known.facing[s]) > ZERO
+                            # What is round on what is flat, either of which may be that of the sample.
+                            if flat == 2 or (flat == 1 and known.rim[s] == 0 and not on_face):
+                                own = pose.points * sample.area
+                                if flat == 2:
+                                    own = -solid_normal(d.gradient)
+                                if side.index.turning == 0 or flat == 2:
+                                    touch.flat = 2
+                                    touch.slope = rotation_after(side.b, ZERO) * slope_of(own, normal)
                             touch.precedence = known.precedence[s]
                             touch.presses = wp.where(early or over < ZERO, 1, 0)
                             work.touches[at] = touch
@@ -349,6 +417,9 @@ def list_pair(
     if side.other.solid == _UNKNOWN:
         return -2 - side.other.geom
     sink = _SINK * wp.min(part.thickness, side.part.thickness)
+    side.band = part.band
+    side.slack = part.slack
+    side.coarse = wp.where(part.grain < _FINER * side.part.grain, 1, 0)
     n = int(0)
     if side.other.solid >= 0:
         side.sign = ONE
@@ -362,6 +433,9 @@ def list_pair(
         flipped.a = side.b
         flipped.b = side.a
         flipped.sign = -ONE
+        flipped.band = side.part.band
+        flipped.slack = side.part.slack
+        flipped.coarse = wp.where(side.part.grain < _FINER * part.grain, 1, 0)
         both = list_side(known, model, work, flipped, settings.margin, settings.gap, sink, way, h, n)
     if both == 0:
         return begin

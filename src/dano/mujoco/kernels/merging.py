@@ -23,6 +23,7 @@ from dano.mujoco.kernels.tables import (
     PartIndex,
     Settings,
     Touch,
+    vec2,
     vec9,
     Work,
 )
@@ -33,6 +34,172 @@ from dano.physics.real import HALF, ONE, real, vec3, ZERO
 _SPREAD = wp.constant(real(1.5))
 # Least of the factor of normals, so that a sample against which all heads are turned goes somewhere.
 _AGAINST = wp.constant(real(1e-3))
+# Length of the sum of what faces one direction over the sum of lengths, at least.
+_PARALLEL = wp.constant(real(0.9999))
+# Curvature times mean square over mean depth from which on a direction begins to count as round; from twice
+# as much on it does. It is 1 for a cap and for a line.
+_ROUND = wp.constant(real(0.35))
+# Determinant of the squares of places over the square of their trace: below, samples lie on a line.
+_SINGULAR = wp.constant(real(1e-6))
+# Share of what touches that is round, where it counts as round.
+_MOSTLY = wp.constant(real(0.9))
+# Share of the mean depth from which on samples on flat faces count by their areas alone.
+_SHALLOW = wp.constant(real(0.25))
+
+
+@wp.func
+def flatness(touches: wp.array(dtype=Touch), begin: int, end: int) -> int:
+    """1 where most of what touches is flat, in one direction; 2 where what is round lies on a flat face."""
+    area = ZERO
+    flat = ZERO
+    round = ZERO
+    along = vec3()
+    for i in range(begin, end):
+        area += touches[i].area
+        along += touches[i].area * touches[i].normal
+        if touches[i].flat >= 1:
+            flat += touches[i].area
+        if touches[i].flat == 2:
+            round += touches[i].area
+    found = int(0)
+    if flat > HALF * area and wp.length(along) > _PARALLEL * area:
+        found = 1
+        if round > _MOSTLY * area:
+            found = 2
+    return found
+
+
+@wp.func
+def set_scores(work: wp.ref[Work], begin: int, end: int, flat: bool):
+    """Say how samples score before their precedence: by their loads, and on a flat face by their areas.
+
+    There all are about as deep, and by loads heads would change places at each tremble. A sample that hardly
+    touches has a load that is less than its share, and that counts.
+    """
+    weight = ZERO
+    area = ZERO
+    for i in range(begin, end):
+        weight += work.touches[i].weight
+        area += work.touches[i].area
+    enough = _SHALLOW * weight / area
+    for i in range(begin, end):
+        score = work.touches[i].weight
+        if flat:
+            score = wp.min(score, enough * work.touches[i].area)
+        work.touches[i].score = score * work.touches[i].precedence
+
+
+@wp.struct
+class Bulge:
+    """What is round above a flat face, by its two principal directions along the face."""
+
+    middle: vec3  # Of the samples that touch [m, W]
+    first: vec3  # Direction [W]
+    second: vec3  # The other
+    at: vec2  # Where along them it is lowest, from the middle on [m]
+    bend: vec2  # Its curvature along them [1/m]
+    share: vec2  # 1 where it is round, 0 where it is flat
+
+
+@wp.func
+def roundness(bend: real, spread: real, depth: real) -> real:
+    """1 along a direction in which depths are those of an arc, 0 where they do not differ.
+
+    Args:
+        bend: Curvature [1/m].
+        spread: Mean square of places [m²].
+        depth: Mean [m].
+    """
+    return wp.clamp((bend * spread / depth - _ROUND) / _ROUND, ZERO, ONE)
+
+
+@wp.func
+def bulge_of(work: wp.ref[Work], begin: int, end: int) -> Bulge:
+    """What is round in the samples that touch a flat face: slopes grow along it by the curvature.
+
+    The curvature is the slope's regression on places. An arc's depth is half of curvature times the square
+    of a place: then curvature times mean square is the mean depth, of a cap and of a line.
+    """
+    found = Bulge()
+    area = ZERO
+    load = ZERO
+    slope = vec3()
+    along = vec3()
+    for i in range(begin, end):
+        touch = work.touches[i]
+        area += touch.area
+        load += touch.weight
+        found.middle += touch.area * touch.position
+        slope += touch.area * touch.slope
+        along += touch.area * touch.normal
+    found.middle = found.middle / area
+    slope = slope / area
+    frame = tangents(wp.normalize(along))
+    u = vec3(frame[3], frame[4], frame[5])
+    v = vec3(frame[6], frame[7], frame[8])
+    xx = ZERO
+    xy = ZERO
+    yy = ZERO
+    sxx = ZERO
+    sxy = ZERO
+    syx = ZERO
+    syy = ZERO
+    for i in range(begin, end):
+        touch = work.touches[i]
+        arm = touch.position - found.middle
+        tilt = touch.slope - slope
+        x = wp.dot(arm, u)
+        y = wp.dot(arm, v)
+        xx += touch.area * x * x
+        xy += touch.area * x * y
+        yy += touch.area * y * y
+        sxx += touch.area * wp.dot(tilt, u) * x
+        sxy += touch.area * wp.dot(tilt, u) * y
+        syx += touch.area * wp.dot(tilt, v) * x
+        syy += touch.area * wp.dot(tilt, v) * y
+    determinant = xx * yy - xy * xy
+    if determinant > _SINGULAR * (xx + yy) * (xx + yy):
+        kxx = (sxx * yy - sxy * xy) / determinant
+        kxy = HALF * (sxy * xx - sxx * xy + syx * yy - syy * xy) / determinant
+        kyy = (syy * xx - syx * xy) / determinant
+        turn = HALF * wp.atan2(kxy + kxy, kxx - kyy)
+        c = wp.cos(turn)
+        s = wp.sin(turn)
+        found.first = c * u + s * v
+        found.second = c * v - s * u
+        bend = vec2(
+            c * c * kxx + real(2.0) * c * s * kxy + s * s * kyy,
+            s * s * kxx - real(2.0) * c * s * kxy + c * c * kyy,
+        )
+        spread = (
+            vec2(
+                c * c * xx + real(2.0) * c * s * xy + s * s * yy,
+                s * s * xx - real(2.0) * c * s * xy + c * c * yy,
+            )
+            / area
+        )
+        found.bend = bend
+        depth = load / area
+        found.share = vec2(roundness(bend[0], spread[0], depth), roundness(bend[1], spread[1], depth))
+        if found.share[0] > ZERO:
+            found.at[0] = -wp.dot(slope, found.first) / bend[0]
+        if found.share[1] > ZERO:
+            found.at[1] = -wp.dot(slope, found.second) / bend[1]
+    return found
+
+
+@wp.func
+def lowest(touch: Touch, bulge: Bulge) -> Touch:
+    """A touch moved to where what is round is lowest."""
+    found = touch
+    arm = touch.position - bulge.middle
+    way = wp.dot(arm, bulge.first) - bulge.at[0]
+    found.position -= (bulge.share[0] * way) * bulge.first
+    found.gap -= HALF * bulge.share[0] * bulge.bend[0] * way * way
+    way = wp.dot(arm, bulge.second) - bulge.at[1]
+    found.position -= (bulge.share[1] * way) * bulge.second
+    found.gap -= HALF * bulge.share[1] * bulge.bend[1] * way * way
+    return found
 
 
 @wp.func
@@ -41,7 +208,7 @@ def too_low(work: wp.ref[Work], begin: int, end: int, most: int) -> real:
     for k in range(most + 1):
         work.scores[k] = ZERO
     for i in range(begin, end):
-        score = work.touches[i].weight * work.touches[i].precedence
+        score = work.touches[i].score
         k = int(most)
         if score > work.scores[k]:
             while k > 0 and score > work.scores[wp.max(k - 1, 0)]:
@@ -82,7 +249,7 @@ def find_heads(work: wp.ref[Work], begin: int, end: int, most: int) -> int:
     low = too_low(work, begin, end, most)
     heads = int(0)
     for i in range(begin, end):
-        score = work.touches[i].weight * work.touches[i].precedence
+        score = work.touches[i].score
         kept = ZERO
         if score > low:
             kept = ONE - low / score
@@ -212,18 +379,34 @@ def merge(
 ) -> int:
     """Write touches as contacts, from a row on; the row beyond the last."""
     most = int(options.most)
+    bulge = Bulge()
+    flat = flatness(work.touches, begin, end)
+    if flat == 2:
+        bulge = bulge_of(work, begin, end)
     if end - begin <= most:
         for i in range(begin, end):
-            touch = work.touches[i]
+            touch = lowest(work.touches[i], bulge)
             write(work, at, touch, touch.presses == 1, settings, a, b, sink, options)
             at += 1
         return at
+    set_scores(work, begin, end, flat == 1)
     heads = find_heads(work, begin, end, most)
     near = _SPREAD * spread_of(work.touches, begin, end) / real(most)
     for i in range(begin, end):
         work.touches[i].drawn = pull_on(work, work.touches[i], heads, near)
     for k in range(heads):
         touch, samples = led_touch(work, work.heads[k], begin, end, near)
-        write(work, at, touch, touch.presses == 1, in_parallel(settings, samples), a, b, sink, options)
+        touch = lowest(touch, bulge)
+        write(
+            work,
+            at,
+            touch,
+            touch.presses == 1,
+            in_parallel(settings, samples, flat == 1),
+            a,
+            b,
+            sink,
+            options,
+        )
         at += 1
     return at

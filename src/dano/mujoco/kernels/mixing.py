@@ -16,6 +16,8 @@ _LEAST_WEIGHT = wp.constant(real(1e-15))
 _E = wp.constant(real(2.718281828459045))
 # Samples for which a contact counts at most: MuJoCo's solver slows down where compliances differ too much.
 _MOST_SAMPLES = wp.constant(real(6.0))
+# The same where two flat faces meet, all contacts of which are as compliant: a tower of soft ones buckles.
+_MOST_FLAT = wp.constant(real(30.0))
 # Share of the way of a step by which contacts that come into being early lie within their margin.
 _INSIDE = wp.constant(real(1e-3))
 # Impedance of contacts that are to end an approach within the step.
@@ -100,10 +102,10 @@ def stiffened(impedance: real, samples: real) -> real:
 
 
 @wp.func
-def in_parallel(settings: Settings, samples: real) -> Settings:
-    """Parameters of a contact that stands for so many samples."""
+def in_parallel(settings: Settings, samples: real, flat: bool) -> Settings:
+    """Parameters of a contact that stands for so many samples; `flat`: of two faces."""
     found = settings
-    n = wp.min(samples, _MOST_SAMPLES)
+    n = wp.min(samples, wp.where(flat, _MOST_FLAT, _MOST_SAMPLES))
     imp = settings.solimp
     found.solimp = vec5(stiffened(imp[0], n), stiffened(imp[1], n), imp[2], imp[3], imp[4])
     return found

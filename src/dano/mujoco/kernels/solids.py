@@ -4,7 +4,7 @@ import warp as wp
 
 from dano.mujoco.kernels.tables import Known, Model, PartIndex
 from dano.mujoco.kernels.words import HEIGHTS, HULL
-from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
+from dano.physics.real import INFINITY, ONE, real, vec3, vec4, ZERO
 from dano.physics.solids.distances import leaf_clearance, leaf_distance
 from dano.physics.solids.grids import closest_in_grid, coarse_bound, place_in_grid
 from dano.physics.solids.kinds import BOX, ELLIPSOID, GRID, HALF_SPACE
@@ -80,6 +80,50 @@ def part_distance(known: Known, model: Model, part: PartIndex, x: vec3) -> Dista
     else:
         d = leaf_distance(known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x)
     return d
+
+
+@wp.func(inline=True)
+def beyond(plane: vec4, x: vec3) -> real:
+    """Height above a plane [m]."""
+    return plane[0] * x[0] + plane[1] * x[1] + plane[2] * x[2] + plane[3]
+
+
+@wp.func
+def distance_with_faces(
+    known: wp.ref[Known], model: wp.ref[Model], part: PartIndex, band: real, x: vec3
+) -> tuple[Distance, int]:
+    """`part_distance`, by the flat faces of an object where one of them is nearest; 1 if one is.
+
+    Below or above a face, and nearer to its plane than to its edges, the distance is that of the plane. Where
+    edges are nearer, what the grid rounds does not make it deeper than the plane.
+    """
+    d = Distance()
+    d.value = real(INFINITY)
+    deepest = real(-INFINITY)
+    of_deepest = vec3()
+    for f in range(part.first_face, part.first_face + part.faces):
+        face = known.faces[f]
+        height = beyond(face.plane, x)
+        if wp.abs(height) < band:
+            aside = real(-INFINITY)
+            for k in range(face.first, face.first + face.count):
+                aside = wp.max(aside, beyond(known.edges[k], x))
+            if aside <= wp.min(height, ZERO):
+                if height < d.value:
+                    d.value = height
+                    d.gradient = vec3(face.plane[0], face.plane[1], face.plane[2])
+            elif aside < band and height <= ZERO and height > deepest:
+                deepest = height
+                of_deepest = vec3(face.plane[0], face.plane[1], face.plane[2])
+    flat = int(1)
+    if d.value == real(INFINITY):
+        flat = 0
+        d = part_distance(known, model, part, x)
+        if d.value < deepest:
+            d.value = deepest
+            d.gradient = of_deepest
+            flat = 1
+    return d, flat
 
 
 @wp.func(inline=True)

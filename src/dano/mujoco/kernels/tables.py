@@ -29,12 +29,18 @@ class Part:
         scale: Semi-axes of a ball or an ellipsoid, ones for others [m].
         radius: Of the ball around an object [m]; unused for geoms.
         thickness: Half of what is to be gone through at the thickest place [m].
+        band: How far from their planes the flat faces of an object say its distance [m].
+        slack: How much less than the sampled distance that may be [m].
+        grain: Area of one of its samples [m²].
     """
 
     middle: vec3
     scale: vec3
     radius: real
     thickness: real
+    band: real
+    slack: real
+    grain: real
 
 
 @wp.struct
@@ -51,8 +57,19 @@ class PartIndex:
     solid: wp.int32  # Kind of its solid, see `dano.mujoco.kernels.solids`; −1 for none
     at: wp.int32  # Leaf of a solid of `dano.physics`, first plane of a hull, height field
     count: wp.int32  # Planes of a hull
+    first_face: wp.int32  # Of the flat faces of an object
+    faces: wp.int32  # How many it has
     contype: wp.int32  # Of an object, as of MuJoCo's geoms
     conaffinity: wp.int32  # The same
+
+
+@wp.struct
+class Face:
+    """A convex flat face of an object."""
+
+    plane: vec4  # Unit outward normal and offset [m]
+    first: wp.int32  # Of the planes through its edges, normal to it
+    count: wp.int32  # How many there are
 
 
 @wp.struct
@@ -77,6 +94,10 @@ class Known:
     runs: wp.array(dtype=vec4)  # The same around each run of blocks
     solids: Solids  # Sampled distances and shapes
     planes: wp.array(dtype=vec4)  # Unit outward normal and offset [m] of the faces of hulls
+    faces: wp.array(dtype=Face)  # Of objects
+    edges: wp.array(dtype=vec4)  # Planes through the edges of faces
+    facing: wp.array(dtype=vec3)  # Normal of the face that each sample lies within, zero for none
+    rim: wp.array(dtype=wp.int32)  # 1 where it lies on the edge of a face
     sizes: wp.array(dtype=vec3)  # Of the geoms when this was made [m], shape (geoms,)
 
 
@@ -162,23 +183,31 @@ class Touch:
         weight: Its area times its depth at the end of the step, or now if that is more [m³].
         position: Between the two surfaces [m, W].
         normal: From the first part to the second [W].
+        slope: How the gap grows along the face, of flat ones [1, W].
         gap: Between the surfaces, negative where they overlap [m].
         nearing: Speed at which the gap closes [m/s].
+        area: What of the sample's area faces the other body [m²].
+        score: How much it counts as a head of others, see `dano.mujoco.kernels.merging`.
         precedence: See `Known`.
         kept: Share of its weight that it keeps.
         drawn: How much heads draw it; both see `dano.mujoco.kernels.merging`.
         presses: 0 where it only counts as near.
+        flat: 1 where the normal is that of a flat face of an object, 2 where what is round presses on it.
     """
 
     weight: real
     position: vec3
     normal: vec3
+    slope: vec3
     gap: real
     nearing: real
+    area: real
+    score: real
     precedence: real
     kept: real
     drawn: real
     presses: wp.int32
+    flat: wp.int32
 
 
 @wp.struct

@@ -10,15 +10,10 @@ from dano.vision.capture._capture_files import load_camera as load_camera, load_
 from dano.vision.capture._hull import (
     hull_distance as hull_distance,
     object_box as object_box,
+    spare_of as spare_of,
     viewed_ball as viewed_ball,
 )
 from dano.vision.capture._light import Light as Light
-from dano.vision.capture._masks import (
-    background_mask as background_mask,
-    check_masks as check_masks,
-    is_plain as is_plain,
-    with_masks as with_masks,
-)
 from dano.vision.capture._node_grid import NodeGrid as NodeGrid, resampled as resampled
 from dano.vision.capture._pictures import (
     picture_files as picture_files,
@@ -32,3 +27,13 @@ from dano.vision.capture._ray_set import (
     RaySet as RaySet,
 )
 from dano.vision.capture._rays import box_interval as box_interval, Rays as Rays
+from dano.vision.capture._shown import silhouette as silhouette
+from dano.vision.capture.masks import (
+    background_mask as background_mask,
+    check_masks as check_masks,
+    decided_by_colours as decided_by_colours,
+    is_plain as is_plain,
+    left_out as left_out,
+    Solid as Solid,
+    with_masks as with_masks,
+)

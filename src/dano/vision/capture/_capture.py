@@ -29,8 +29,10 @@ class View(eqx.Module):
         split: One of `SPLITS` (static).
         cut_out: Whether `image` shows the object alone, over black (static).
         background: Colour that it was photographed against, if that is plain and known, shape (3,).
-        doubt: How far the mask of each pixel may be wrong, (height, width): 1 where shadow on the object may
-            have been taken for background (see `with_doubts`); None for nowhere.
+        doubt: How far the mask of each pixel may be wrong, (height, width): 1 where the mask says nothing and
+            colours decide (see `with_doubts`); None for nowhere.
+        behind: What each pixel would show without the object, sRGB, (height, width, 3), NaN where that is not
+            known (see `with_table`); None: `background` everywhere.
     """
 
     name: str = eqx.field(static=True)
@@ -43,11 +45,20 @@ class View(eqx.Module):
     cut_out: bool = eqx.field(static=True, default=False)
     background: Float[np.ndarray, "3"] | None = None
     doubt: Float[np.ndarray, "height width"] | None = None
+    behind: Float[np.ndarray, "height width 3"] | None = None
 
     @property
     def possible(self) -> Float[np.ndarray, "height width"] | None:
         """Share of each pixel that the object may cover: the mask, and what is doubted of it."""
         return self.mask if self.mask is None or self.doubt is None else np.maximum(self.mask, self.doubt)
+
+    @property
+    def known_behind(self) -> Float[np.ndarray, "height width 3"]:
+        """What each pixel would show without the object; NaN where nothing says it."""
+        if self.behind is not None:
+            return self.behind
+        plain = np.full(3, np.nan) if self.background is None else self.background
+        return np.broadcast_to(plain.astype(np.float32), self.image.shape)
 
     @property
     def backdrop(self) -> Float[np.ndarray, "3"]:
@@ -81,8 +92,11 @@ class View(eqx.Module):
             width=width // factor,
             height=height // factor,
         )
-        mask, doubt = (None if a is None else shrunk(a) for a in (self.mask, self.doubt))
-        return self.replaced(camera=camera, image=shrunk(self.image), mask=mask, doubt=doubt)
+        layers = {
+            name: None if (layer := getattr(self, name)) is None else shrunk(layer)
+            for name in ("mask", "doubt", "behind")
+        }
+        return self.replaced(camera=camera, image=shrunk(self.image), **layers)
 
 
 class Capture(eqx.Module):

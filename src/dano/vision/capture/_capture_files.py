@@ -16,8 +16,8 @@ import numpy as np
 from dano.checks import checked_count, checked_path, shown
 from dano.vision.capture._camera import PosedCamera
 from dano.vision.capture._capture import Capture, SPLITS, View
-from dano.vision.capture._masks import cut_out
 from dano.vision.capture._pictures import read_mask, read_picture, Turned
+from dano.vision.capture.masks import cut_out
 
 _HOLD_OUT = 8
 """Where a capture has no split, one in this many views is held out, as is usual since LLFF."""
@@ -221,6 +221,9 @@ def _read_transforms(path: Path) -> list[View]:
         if frame.get("mask_path") not in _UNSET:
             mask = read_mask(path.parent / str(frame["mask_path"]), image.shape[:2], picture.orientation)
             image, cut_out = picture.colours, False
+        doubt = None
+        if frame.get("doubt_path") not in _UNSET:
+            doubt = read_mask(path.parent / str(frame["doubt_path"]), image.shape[:2], picture.orientation)
         light, near = _light(path, i, frame)
         views.append(
             View(
@@ -228,6 +231,7 @@ def _read_transforms(path: Path) -> list[View]:
                 camera=_camera(path, name, values, image.shape[:2]),
                 image=image,
                 mask=mask,
+                doubt=doubt,
                 light=light,
                 light_is_near=near,
                 split=_split(path, i, frame.get("split", named.get(name, "train"))),

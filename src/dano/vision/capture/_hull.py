@@ -15,23 +15,27 @@ from dano.vision.capture._node_grid import NodeGrid
 LOST = 0.02
 """Share of the views that may miss a point of the object: one bad mask does not cut a hole into it."""
 
+_SOME = 8
+"""Photographs from which one can be spared."""
+
 # Points per call, and the multiple to which the last call is filled, so that few sizes are compiled.
 _CHUNK = 1 << 18
 _GRANULE = 1 << 14
 
 
 def silhouettes(
-    points: Float[np.ndarray, "n 3"], views: Sequence[View], lost: float = LOST
+    points: Float[np.ndarray, "n 3"], views: Sequence[View], lost: float = LOST, spare: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """How many views see points [m, W], and how well the silhouettes of those views cover them.
 
     Returns:
         Number of views that have each point in their image, (n,), and the value that all of these masks but
-        the share `lost` of them reach at it, (n,): above ½ for points of the hull, 1 where no view looks.
+        the share `lost` of them, or `spare` if that is more, reach at it, (n,): above ½ for points of the
+        hull, 1 where no view looks.
     """
     masked = [(view, view.possible) for view in views if view.possible is not None]
     size = max(max(possible.shape) for _, possible in masked)
-    n_spare = int(lost * len(masked))
+    n_spare = min(max(int(lost * len(masked)), spare), len(masked) - 1)
     seen, least = [], []
     for start in range(0, len(points), _CHUNK):
         part = points[start : start + _CHUNK]
@@ -142,16 +146,24 @@ def viewed_ball(views: Sequence[View]) -> tuple[np.ndarray, float]:
     return centre, float(np.linalg.norm(positions - centre, axis=1).min())
 
 
-def hull_distance(views: Sequence[View], box: NodeGrid, lost: float = LOST) -> Float[np.ndarray, "nx ny nz"]:
+def spare_of(n_views: int, lost: float = LOST) -> int:
+    """How many photographs may be wrong about a point where masks are doubted: at least one of some."""
+    return max(int(lost * n_views), int(n_views >= _SOME))
+
+
+def hull_distance(
+    views: Sequence[View], box: NodeGrid, lost: float = LOST, *, spare: int = 0
+) -> Float[np.ndarray, "nx ny nz"]:
     """Signed distance [m] of the visual hull at the nodes of a grid, accurate to a fraction of a cell.
 
-    The least mask value over the views crosses ½ on the hull; where it does along the grid's edges lie points
-    of the surface, and a node's distance is that to the nearest of them.
+    Of all masks but the share `lost`, or `spare` if that is more, which may be wrong. The least value of the
+    others crosses ½ on the hull; where it does along the grid's edges lie points of the surface, and a node's
+    distance is that to the nearest of them.
 
     Raises:
         ValueError: If no node is inside.
     """
-    _, cover = silhouettes(box.nodes, views, lost)
+    _, cover = silhouettes(box.nodes, views, lost, spare)
     value = cover.reshape(box.shape) - 0.5
     # Outside on the border, so that the hull is closed where no view looks.
     border = np.ones(box.shape, dtype=bool)

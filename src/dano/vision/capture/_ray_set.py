@@ -23,10 +23,11 @@ class RaySet(NamedTuple):
 
     Attributes:
         rays: Those that may meet the object.
-        colour: sRGB over black of the object alone, shape (rays, 3).
+        colour: sRGB over black of the object alone, shape (rays, 3); where the mask is doubted, of the
+            photograph without the share of `backdrop` that the mask leaves.
         mask: Share of the pixel that the object covers, shape (rays,).
         doubt: How far that may be wrong, shape (rays,).
-        backdrop: What the object was photographed against, or white, shape (rays, 3).
+        backdrop: What the pixel would show without the object, or white, shape (rays, 3).
         view: Number of the view that each belongs to, shape (rays,).
     """
 
@@ -110,6 +111,8 @@ def _span(occupied, lowest, spacing, origin, directions):
 def collect(views: Sequence[View], box: NodeGrid, occupied: Bool[np.ndarray, "nx ny nz"]) -> RaySet:
     """All rays of some views with masks that may meet the object.
 
+    Where a mask is doubted and nothing says what is behind the object, a pixel is left out.
+
     Raises:
         ValueError: If there is none.
     """
@@ -118,12 +121,14 @@ def collect(views: Sequence[View], box: NodeGrid, occupied: Bool[np.ndarray, "nx
         if view.mask is None:
             raise ValueError(f"{view.name} must have a mask")
         pixels, found = rays_of(view.camera, view.light, box, occupied)
-        rays.append(found)
-        colours.append(view.over(np.zeros(3)).reshape(-1, 3)[pixels])
+        colour, doubt, behind, told = _told(view)
+        told = told.reshape(-1)[pixels]
+        pixels = pixels[told]
+        rays.append(Rays(*(column[jnp.asarray(told)] for column in found)))
+        colours.append(colour.reshape(-1, 3)[pixels])
         masks.append(view.mask.reshape(-1)[pixels])
-        doubt = np.zeros_like(view.mask) if view.doubt is None else view.doubt
         doubts.append(doubt.reshape(-1)[pixels])
-        backdrops.append(np.broadcast_to(view.backdrop, (len(pixels), 3)))
+        backdrops.append(behind.reshape(-1, 3)[pixels])
     if not sum(map(len, masks)):
         raise ValueError("no ray of any view meets the object")
 
@@ -138,3 +143,18 @@ def collect(views: Sequence[View], box: NodeGrid, occupied: Bool[np.ndarray, "nx
         backdrop=joined(backdrops),
         view=jnp.asarray(np.repeat(np.arange(len(views), dtype=np.int32), [len(mask) for mask in masks])),
     )
+
+
+def _told(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Colours, doubts and what is behind, of all pixels, and which of these say something."""
+    assert view.mask is not None
+    colour, plain = view.over(np.zeros(3)), np.broadcast_to(view.backdrop, view.image.shape)
+    if view.doubt is None or not view.doubt.any():
+        return colour, np.zeros_like(view.mask), plain, np.ones(view.mask.shape, bool)
+    behind = view.known_behind
+    known = np.isfinite(behind).all(axis=-1)
+    behind, doubt = np.where(known[..., None], behind, plain), view.doubt[..., None]
+    if not view.cut_out:
+        free = view.image - (1 - view.mask[..., None]) * behind
+        colour = (1 - doubt) * colour + doubt * free
+    return colour.astype(np.float32), view.doubt, behind, known | (view.doubt < 0.5)

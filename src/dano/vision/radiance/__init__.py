@@ -3,7 +3,7 @@
 from dano.vision.radiance._appearance import Appearance as Appearance, Network as Network, Share as Share
 from dano.vision.radiance._files import model_of_file as model_of_file
 from dano.vision.radiance._hash_model import HashModel as HashModel
-from dano.vision.radiance._learned import LearnedField as LearnedField
+from dano.vision.radiance._learned import Doubt as Doubt, LearnedField as LearnedField
 from dano.vision.radiance._models import (
     AbstractMedium as AbstractMedium,
     AbstractModel as AbstractModel,

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,6 +24,36 @@ _EDGE = 2.0
 """Sharpness times spacing: φ falls from 0.9 to 0.1 over two cells, which a grid of that spacing can hold."""
 
 
+class Doubt(NamedTuple):
+    """Standard deviations of what a learned object is beside the true one, in all pictures of it."""
+
+    offset: float = 0.01  # Of its middle, along each axis, as a share of its size
+    turn: float = 6e-3  # [rad]
+    share: float = 2.5e-3  # By which it is too large, and so seems too near
+
+    @staticmethod
+    def of_training(unexplained: float, unseen: float) -> "Doubt":
+        """What training knows of it.
+
+        A rim of width δ around a disc of diameter 1 is 4 δ of its area. So silhouettes of which a share u is
+        not explained are, if all of that is on one side, off by u/4: a third of which is taken for what an
+        axis has (measured with solids whose truth is known). Nobody photographs what an object stands on,
+        usually a quarter of its surface: with nothing unexplained the numbers are those of a `Doubt()`.
+
+        Args:
+            unexplained: Share of the silhouettes that the object does not explain.
+            unseen: Share of its surface that fewer than two photographs show.
+        """
+        return Doubt(
+            float(np.hypot(0.002 + 0.04 * unseen, unexplained / 6)),
+            float(np.hypot(0.001 + 0.02 * unseen, unexplained / 6)),
+            float(np.hypot(2.5e-3, unexplained / 8)),
+        )
+
+
+_USUAL = Doubt()
+
+
 class LearnedField(AbstractField):
     """An occupancy probability φ = 1/(1 + exp(s d)) ∈ [0, 1] around a learned signed distance d.
 
@@ -31,15 +62,17 @@ class LearnedField(AbstractField):
         sharpness: s [1/m].
         model: What was trained, for pictures.
         drawn_sharpness: Sharpness [1/m] of the model's surface in pictures.
+        doubt: By how much it may be beside the true object.
     """
 
     solid: SignedDistanceGrid
     sharpness: Float[Array, ""]
     model: SurfaceModel
     drawn_sharpness: Float[Array, ""]
+    doubt: Doubt = eqx.field(static=True, default=_USUAL)
 
     @classmethod
-    def from_model(cls, model: SurfaceModel, drawn_sharpness: float) -> "LearnedField":
+    def from_model(cls, model: SurfaceModel, drawn_sharpness: float, doubt: Doubt = _USUAL) -> "LearnedField":
         """Make a trained model a field.
 
         Raises:
@@ -61,7 +94,12 @@ class LearnedField(AbstractField):
             jnp.asarray(_EDGE / box.spacing),
             model,
             jnp.asarray(drawn_sharpness),
+            doubt,
         )
+
+    def doubted(self, doubt: Doubt) -> "LearnedField":
+        """The field with another doubt."""
+        return LearnedField(self.solid, self.sharpness, self.model, self.drawn_sharpness, doubt)
 
     @property
     def bounds(self) -> Float[Array, "2 3"]:
@@ -116,7 +154,7 @@ class LearnedField(AbstractField):
         z = float(model.origin[2]) + float(model.spacing) * np.arange(model.distance.shape[2])
         below = jnp.asarray((height - z) / float(model.scale), model.distance.dtype)
         cut = eqx.tree_at(lambda m: m.distance, model, jnp.maximum(model.distance, below[None, None]))
-        return LearnedField.from_model(cut, float(self.drawn_sharpness))
+        return LearnedField.from_model(cut, float(self.drawn_sharpness), self.doubt)
 
     def picture(self, camera: AbstractCamera, light: Numbers | None = None) -> Picture:
         """What a camera sees.
@@ -155,6 +193,7 @@ class LearnedField(AbstractField):
             "near_light": np.array(appearance.near_light),
             "layers": np.array(len(appearance.network.weights)),
             "drawn_sharpness": self.drawn_sharpness,
+            "doubt": np.array(self.doubt),
         }
         for i, (weight, bias) in enumerate(
             zip(appearance.network.weights, appearance.network.biases, strict=True)
@@ -213,6 +252,8 @@ class LearnedField(AbstractField):
                 appearance=appearance,
                 **{name: on_device(data[name]) for name in ("distance", "origin", "spacing", "scale")},
             )
-            return cls.from_model(model, float(data["drawn_sharpness"]))
+            # Older files do not say it.
+            stated = Doubt(*(float(x) for x in data["doubt"])) if "doubt" in data else _USUAL
+            return cls.from_model(model, float(data["drawn_sharpness"]), stated)
         except (KeyError, ValueError) as error:
             raise ValueError(f"{path} is not a valid learned field: {error}") from error

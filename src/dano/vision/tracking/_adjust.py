@@ -16,6 +16,7 @@ from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.tracking._refine import refine, Refined, window_of
 from dano.vision.tracking._result import HIDDEN, LOST, OUTSIDE, TRACKED, Tracked, tracked
+from dano.vision.tracking._steady import steady_film
 from dano.vision.tracking._subject import Subject
 from dano.vision.tracking._whole import learn_frame, LIGHT_FRAMES
 
@@ -63,7 +64,7 @@ def adjust_poses(
     checked_kind("field", field, LearnedField)
     checked_kind("camera", camera, PosedCamera)
     chosen, n = options or TrackOptions(), len(film.times)
-    film.check_size(camera)
+    film = steady_film(film, camera, background, chosen.readout)
     for name, array, width in (("position", position, 3), ("orientation", orientation, 4)):
         if np.shape(array) != (n, width):
             raise ValueError(f"{name} must have shape ({n}, {width}), got {np.shape(array)}")

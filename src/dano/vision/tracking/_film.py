@@ -42,6 +42,10 @@ class Film(NamedTuple):
         shrunk: Pixels of the original a side that were averaged into one.
         notes: Sentences about times and sizes.
         start: When a player shows the first of these frames [s].
+        turns: Of the camera against the first frame, as quaternions that take directions in the first camera
+            to those in each (see `steady_film`); None: not looked for. Frames are without them.
+        place_at: Where the picture of the place is looked up for each pixel of such frames, rows and columns;
+            None: at the same pixel.
     """
 
     names: tuple[str, ...]
@@ -52,6 +56,8 @@ class Film(NamedTuple):
     shrunk: int
     notes: tuple[str, ...]
     start: float = 0.0
+    turns: Float[np.ndarray, "T 4"] | None = None
+    place_at: Float[np.ndarray, "2 height width"] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -135,7 +141,24 @@ class Film(NamedTuple):
                 f"background must have the size of the frames, {width * k} × {height * k},"
                 f" got {found[1] * k} × {found[0] * k}"
             )
-        return pixels.astype(np.float32) / 255
+        return self.looked_up(pixels, self.place_at).astype(np.float32) / 255
+
+    @staticmethod
+    def looked_up(picture: np.ndarray, at: Float[np.ndarray, "2 height width"] | None) -> np.ndarray:
+        """A picture at rows and columns between its pixels, by cubic splines; of the same type.
+
+        Args:
+            picture: Of 8 bits, or with values from 0 to 1.
+            at: Where; None: the picture stays as it is.
+        """
+        if at is None:
+            return picture
+        channels = np.moveaxis(np.atleast_3d(picture).astype(np.float64), 2, 0)
+        found = [ndimage.map_coordinates(one, at, order=3, mode="nearest") for one in channels]
+        result = np.stack(found, axis=2).reshape(picture.shape)
+        if picture.dtype == np.uint8:
+            return np.clip(np.rint(result), 0, 255).astype(np.uint8)
+        return np.clip(result, 0, 1).astype(picture.dtype)
 
 
 class Target(NamedTuple):

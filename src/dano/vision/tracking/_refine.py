@@ -5,6 +5,7 @@ deviation and weighted robustly; derivatives are the renderer's. Levenberg's dam
 went too far.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -189,6 +190,38 @@ def linearized(
     change = -np.linalg.solve(hessian + _GROUND * np.trace(hessian) * np.eye(6), gradient)
     change *= min(1.0, _FURTHEST / max(float(np.abs(change).max()), 1e-9))
     return found._replace(place=place.moved(change, subject.radius))
+
+
+def costs_of(
+    subject: Subject,
+    target: Target,
+    places: Sequence[Placement],
+    lamps: tuple[Light, ...],
+    *,
+    loss: str,
+    rays: int,
+    random: np.random.Generator,
+) -> list[float]:
+    """Mean robust costs of a pixel at several poses, over the pixels that any of them shows.
+
+    Args:
+        subject: The object.
+        target: The picture.
+        places: The poses.
+        lamps: Light.
+        loss: As in `TrackOptions`.
+        rays: Most pixels for each of the poses.
+        random: Which pixels are taken if there are more.
+
+    Returns:
+        ∞ for all of them if no pixel shows the object.
+    """
+    chosen = [_chosen(subject, target, place, lamps, rays, random) for place in places]
+    shown = [index for index in chosen if index is not None]
+    if not shown:
+        return [np.inf] * len(places)
+    index = np.unique(np.concatenate(shown), axis=0)
+    return [_rows(subject, target, place, lamps, index, loss, slopes=False).cost for place in places]
 
 
 def _least_shown(found: Refined) -> Float[np.ndarray, "6"]:

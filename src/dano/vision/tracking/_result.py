@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from dano.maths import quat_to_matrix
 from dano.vision.capture import Light
+from dano.vision.radiance import Doubt
 from dano.vision.tracking._film import Film
 from dano.vision.tracking._refine import Refined
 from dano.vision.tracking._subject import Subject
@@ -67,7 +68,8 @@ class Tracked(NamedTuple):
         position: Of the origin of the object's frame [m, W], shape (T, 3).
         orientation: Unit quaternions wxyz, object → world, shape (T, 4).
         covariance: Of each pose: of the position [m, W], then of the rotation vector [rad, object's frame],
-            shape (T, 6, 6).
+            shape (T, 6, 6), with what all frames share because the learned object is beside the true one.
+        own: The same without most of that, which `doubt` states.
         status: Of each frame: "tracked", "lost", "outside" the picture, or "hidden".
         quality: Overlap of each mask with the silhouette, as intersection over union, shape (T,).
         colour_error: Usual difference of colours of each frame, in sRGB, shape (T,).
@@ -80,12 +82,14 @@ class Tracked(NamedTuple):
         messages: What a user should know, in sentences.
         seconds: Time after the search at the start, over the number of frames [s].
         repeats: In how many poses what one frame shows is found again, shape (T,); see `Smoothed`.
+        doubt: By how much the object may be beside the true one, in all frames.
     """
 
     times: Float[np.ndarray, " T"]
     position: Float[np.ndarray, "T 3"]
     orientation: Float[np.ndarray, "T 4"]
     covariance: Float[np.ndarray, "T 6 6"]
+    own: Float[np.ndarray, "T 6 6"]
     status: tuple[str, ...]
     quality: Float[np.ndarray, " T"]
     colour_error: Float[np.ndarray, " T"]
@@ -95,6 +99,7 @@ class Tracked(NamedTuple):
     messages: tuple[str, ...]
     seconds: float
     repeats: Float[np.ndarray, " T"]
+    doubt: Doubt
 
     @property
     def n_tracked(self) -> int:
@@ -147,10 +152,15 @@ def tracked(
     texts = [*film.notes, *notes, *unobservable(known, subject), *_messages(film, status, ambiguity)]
     if motion is not None:
         texts += _of_motion(film, motion)
+    whole = covariance.copy()
+    for i in np.flatnonzero(np.isfinite(position[:, 0])):
+        away = position[i] + quat_to_matrix(orientation[i]) @ subject.centre - eye
+        whole[i] += learned_covariance(subject, orientation[i], away)
     return Tracked(
         film.times,
         position,
         orientation,
+        whole,
         covariance,
         tuple(status),
         quality,
@@ -161,6 +171,7 @@ def tracked(
         tuple(texts),
         seconds,
         np.where(np.isfinite(position[:, 0]), 1.0, np.nan) if motion is None else motion.repeats,
+        subject.doubt,
     )
 
 
@@ -232,7 +243,27 @@ def shared_covariance(subject: Subject, orientation: Float[np.ndarray, "4"]) -> 
 
     The object is turned about its middle: an origin that lies elsewhere goes with it.
     """
-    alone = np.diag(np.repeat([(_PLACE_DOUBT * subject.size) ** 2, _TURN_DOUBT**2], 3))
+    return _carried(subject, orientation, _PLACE_DOUBT, _TURN_DOUBT)
+
+
+def learned_covariance(
+    subject: Subject, orientation: Float[np.ndarray, "4"], away: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "6 6"]:
+    """Covariance of what training says that the object may be beside the true one (`Doubt`).
+
+    Args:
+        subject: The object.
+        orientation: Its.
+        away: From the camera to its middle [m, W]: what is too large seems too near.
+    """
+    offset, turn, share = subject.doubt
+    result = _carried(subject, orientation, offset, turn)
+    result[:3, :3] += share**2 * np.outer(away, away)
+    return result
+
+
+def _carried(subject: Subject, orientation: Float[np.ndarray, "4"], offset: float, turn: float) -> np.ndarray:
+    alone = np.diag(np.repeat([(offset * subject.size) ** 2, turn**2], 3))
     carried = np.eye(6)
     carried[:3, 3:] = quat_to_matrix(orientation) @ np.cross(np.eye(3), subject.centre)
     return carried @ alone @ carried.T

@@ -80,6 +80,7 @@ class Subject:
         radius: Of that ball [m].
         size: Longest side of its box [m].
         lit: Whether its look depends on the light.
+        doubt: By how much it may be beside the true object.
     """
 
     def __init__(self, field: LearnedField):
@@ -88,6 +89,7 @@ class Subject:
         self.radius = 0.5 * float(np.linalg.norm(upper - lower))
         self.size = float((upper - lower).max())
         self.lit = bool(field.model.appearance.lit)
+        self.doubt = field.doubt
         self._model = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), field.model)
         self._field = field
         self._drawn = float(field.drawn_sharpness)

@@ -16,6 +16,7 @@ from dano.vision.tracking._film import Film
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._result import Tracked
+from dano.vision.tracking._steady import steady_film
 from dano.vision.tracking._walk import Walk
 
 _SEARCHED, _WALKED, _AGAIN = 0.1, 0.55, 0.7
@@ -40,7 +41,8 @@ def track(
     Args:
         film: The frames.
         field: The object, as photographs taught it.
-        camera: Which took the film, standing still; of the size of the original frames.
+        camera: Which took the film, of the size of the original frames. If it was turned meanwhile, as in a
+            hand (see `steady_film`), that of the first frame, from which poses are seen then.
         options: How.
         background: A picture of the place without the object, by the same camera.
         start: Position [m, W] and orientation (wxyz) in the first frame, roughly; default: they are searched.
@@ -51,7 +53,7 @@ def track(
             or the object is in no frame.
     """
     chosen = options or TrackOptions()
-    film.check_size(camera)
+    film = steady_film(film, camera, background, chosen.readout)
     walk = Walk(film, field, camera, chosen, background)
     if start is not None:
         place = checked_array("position of start", start[0], (3,))

@@ -255,12 +255,17 @@ def _loss(
     model = eqx.tree_at(lambda m: m.raw, model, raw)
     seen = see(model, batch.rays, sampling=_SAMPLING, view_share=0.0, key=key)
     met = batch.mask[:, None] * seen.colour / jnp.maximum(seen.opacity, 1e-3)[:, None]
+    # Where a mask is doubted a ray may look through a hole at what is behind.
+    doubt = batch.doubt[:, None]
+    through = seen.colour + (1 - seen.opacity)[:, None] * batch.backdrop
+    wanted = batch.colour + doubt * (1 - batch.mask)[:, None] * batch.backdrop
+    got = (1 - doubt) * met + doubt * through
     cell = -jnp.expm1(-jax.nn.softplus(raw))
     count = jnp.sum(allowed.astype(cell.dtype))
     unclear = jnp.sum(jnp.where(allowed, cell * (1 - cell), 0)) / count
     uneven = sum((jnp.mean(jnp.abs(jnp.diff(cell, axis=axis))) for axis in range(3)), jnp.float32(0))
     return (
-        jnp.mean((met - batch.colour) ** 2)
+        jnp.mean((got - wanted) ** 2)
         + _MASK_WEIGHT * jnp.mean((1 - batch.doubt) * (seen.opacity - batch.mask) ** 2)
         + _CLEAR_WEIGHT * unclear
         + _EVEN_WEIGHT * uneven

@@ -1,15 +1,15 @@
-"""Doubts about masks: shadow on the object that was taken for background.
+"""Doubts about masks: parts of the object that were taken for background.
 
-A mask by a threshold leaves out what is as dark as a dark background, and a bite out of few masks is a hole
-in the hull of all silhouettes. Nothing in one photograph tells such a bite from a gap through which the
-background is seen. But if the silhouettes fit a hull better that more of them may miss, then bites are
-likely: they are left open, and what the other photographs show decides.
+A mask by a threshold leaves out what is as dark as a dark background, and one that was made on a table what
+looks like that. A bite out of few masks is a hole in the hull of all silhouettes. Nothing in one photograph
+tells such a bite from a gap through which the background is seen. But if the silhouettes fit a hull better
+that more of them may miss, then bites are likely: they are left open, and what the other photographs show
+decides.
 """
 
 import numpy as np
-from scipy import ndimage
 
-from dano.vision.capture import Capture, hull_distance, NodeGrid, rays_of, View
+from dano.vision.capture import Capture, hull_distance, left_out, NodeGrid, silhouette, spare_of, View
 from dano.vision.training._survey import silhouette_residual, Survey, survey
 
 _CONSISTENT = 0.015
@@ -25,18 +25,18 @@ _LOOKS = 40
 def with_doubts(capture: Capture, found: Survey) -> tuple[Capture, Survey]:
     """The capture with its doubts about masks, and the survey without what they had cut off the hull.
 
-    Only masks on a known, plain background are doubted: those from an alpha channel are taken as stated.
+    Masks from an alpha channel are taken as stated. At least one photograph may be wrong about a point.
 
     Args:
         capture: Photographs with masks.
         found: What `survey` says about it; its residual stays that of the masks as they are.
     """
     train = capture.split("train")
-    if found.residual < _CONSISTENT or all(view.background is None for view in train):
+    if found.residual < _CONSISTENT or all(_is_stated(view) for view in train):
         return capture, found
     hulls, residuals = [found.hull], [silhouette_residual(train, found.box, found.hull, _LOOKS)]
     for lost in _LOST:
-        hulls.append(hull_distance(train, found.box, lost))
+        hulls.append(hull_distance(train, found.box, lost, spare=spare_of(len(train), lost)))
         residuals.append(silhouette_residual(train, found.box, hulls[-1], _LOOKS))
         if residuals[-1] >= min(residuals[:-1]):
             break
@@ -60,14 +60,16 @@ def with_doubts(capture: Capture, found: Survey) -> tuple[Capture, Survey]:
     return doubted, again._replace(residual=found.residual, warnings=(*found.warnings, told))
 
 
+def _is_stated(view: View) -> bool:
+    """Whether its mask is an alpha channel."""
+    return view.cut_out and view.background is None
+
+
 def _doubted(view: View, box: NodeGrid, hull: np.ndarray) -> View:
     """A view whose mask is doubted where it leaves out more than a rim of a hull's silhouette."""
-    if view.mask is None or view.background is None:
+    if view.mask is None or _is_stated(view):
         return view
-    here = np.zeros(view.mask.shape, bool)
-    here.ravel()[rays_of(view.camera, None, box, hull < 0)[0]] = True
-    missing = ndimage.binary_opening(here & (view.mask < 0.5))
+    missing = left_out(view.mask, silhouette(view.camera, box, hull))
     if not missing.any():
         return view
-    doubt = ndimage.binary_dilation(missing) & here
-    return view.replaced(doubt=doubt.astype(np.float32))
+    return view.replaced(doubt=missing if view.doubt is None else np.maximum(view.doubt, missing))

@@ -6,7 +6,8 @@ Rays are rendered in front of random backgrounds, so that transparency cannot pa
 
 with c, o the rendered colour and opacity, C, M the photograph and its mask, b the background, and the last
 two terms over nodes near the surface, which keep d a smooth signed distance. Where a mask is doubted the
-object may be there or not, as long as the photograph comes out: b is its own background, and w_m is 0.
+object may be there or not, as long as the photograph comes out: b is its own background, C + (1 − M) b the
+photograph, and w_m is 0.
 
 Where a pixel shows nothing but the object, its error is |c/o − C|² and opacity enough at o = 0.9: a thin wall
 is not opaque as long as its surface is blurred, and to want it to be would thicken it by more than its looks
@@ -38,6 +39,9 @@ _REACH = 3.0
 
 _WHOLE, _OPAQUE = 0.999, 0.9
 """Mask of a pixel that shows nothing but the object, and the opacity that is enough there."""
+
+_DOUBTED = 0.5
+"""Doubt of a mask from which a pixel may show anything."""
 
 _PASSES = 3
 """Times that derivatives are spread to neighbours."""
@@ -129,7 +133,7 @@ def _made_step(options: TrainOptions, lit: bool) -> Callable[..., tuple[Learned,
         background = (1 - doubt) * background + doubt * batch.backdrop
         seen = see(model, rays, sharpness, sampling=sampling, view_share=view_share, key=jitter)
         # What is wrong about a camera shows where object and background mix: that counts everywhere then.
-        whole = (batch.mask > _WHOLE) & (not options.cameras)
+        whole = (batch.mask > _WHOLE) & (batch.doubt < _DOUBTED) & (not options.cameras)
         met = seen.colour / jnp.maximum(seen.opacity, 0.05)[:, None]
         mixed = seen.colour + (1 - seen.opacity)[:, None] * background
         got = jnp.where(whole[:, None], met, mixed)

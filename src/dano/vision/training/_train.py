@@ -14,10 +14,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy import ndimage
 
 from dano.progress import Progress
-from dano.vision.capture import Capture, collect, NodeGrid, object_box, RaySet, resampled, View
-from dano.vision.radiance import Appearance, LearnedField, picture, SurfaceModel
+from dano.vision.capture import (
+    Capture,
+    collect,
+    decided_by_colours,
+    hull_distance,
+    NodeGrid,
+    object_box,
+    RaySet,
+    resampled,
+    silhouette,
+    Solid,
+    spare_of,
+    View,
+)
+from dano.vision.radiance import Appearance, Doubt, LearnedField, picture, SurfaceModel
 from dano.vision.training import _checkpoint
 from dano.vision.training._adjustment import Adjustment
 from dano.vision.training._cavities import find_cavities, STEPS
@@ -43,12 +57,18 @@ _STILL, _COHERENT, _SHARP = 0.125, 0.6, 0.7
 distort the surface (but cameras and surface are learned together); until its nodes move each on its own; and
 until it is sharp."""
 
+_AGAIN = 1 / 6, 1 / 3, 1 / 2, 0.7
+"""Shares of the steps after which masks that colours decide are those of what has been learned."""
+
 _PER_DECIBEL = 0.002
 """What a decibel of PSNR counts beside mask IoU where the best state is chosen: 5 dB as much as 0.01."""
 
 _WORSE, _OF_RESIDUAL = 0.004, 0.5
 """Loss of mask IoU on held-out views that stops training, at least this and this share of what no solid
 explains (chosen; no benchmark varies them)."""
+
+_UNLIKE = 0.12
+"""Difference of colours [sRGB] from which a pixel is not explained."""
 
 _STEADY_VOLUME, _STEADY_QUALITY = 5e-4, 0.03
 """Relative change of volume, and gain of PSNR [dB], below which training has converged (chosen)."""
@@ -93,6 +113,8 @@ class Trained(NamedTuple):
         stopped: Why training ended.
         seconds: From the start, with compilation and final measurements [s].
         unseen: Share of the surface that fewer than two training views see.
+        unexplained: Share of the silhouettes that the field does not explain: of what is not in both its
+            silhouettes and the masks, or where colours decide, of pixels that show another colour.
         warnings: Sentences for the user.
     """
 
@@ -104,6 +126,7 @@ class Trained(NamedTuple):
     stopped: Stopped
     seconds: float
     unseen: float
+    unexplained: float
     warnings: tuple[str, ...]
 
 
@@ -124,6 +147,7 @@ def train(
     capture: Capture,
     options: TrainOptions | None = None,
     *,
+    table: float | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
@@ -134,6 +158,8 @@ def train(
     Args:
         capture: The photographs.
         options: How; default `TrainOptions()`.
+        table: Height z of a level table [m, W] that the object stands on: masks that are doubted (those that
+            `with_masks` found on a table) are only a beginning, and colours of object and table decide.
         checkpoint: File that the state is written to at each evaluation, and when interrupted.
         resume: Go on from `checkpoint` if it exists.
         progress: Called after every few steps, while cavities are looked for and during training.
@@ -157,7 +183,7 @@ def train(
     capture, corners = _shrunk(capture, options)
     capture, found = with_doubts(capture, survey(capture, options.resolution, corners=corners))
     trainer = _Trainer(
-        capture, options, found, Path(checkpoint) if checkpoint is not None else None, progress, folder
+        capture, options, found, Path(checkpoint) if checkpoint is not None else None, progress, folder, table
     )
     state = trainer.resumed() if resume else None
     state, stopped = trainer.run(state)
@@ -166,6 +192,8 @@ def train(
     splits = [s for s in ("test", "relight") if capture.split(s)] or ["train"]
     scores = {s: score(field, capture.split(s)[: 16 if s == "train" else None]) for s in splits}
     unseen = unseen_share(state.model, capture.split("train"))
+    unexplained = trainer.unexplained(field)
+    field = field.doubted(Doubt.of_training(unexplained, unseen))
     warnings = list(found.warnings)
     if unseen > 0.05:
         warnings.append(f"{100 * unseen:.0f} % of the surface is seen by fewer than two views and is a guess")
@@ -180,6 +208,7 @@ def train(
         stopped,
         time.perf_counter() - start,
         unseen,
+        unexplained,
         tuple(warnings),
     )
 
@@ -195,8 +224,12 @@ class _Trainer:
         checkpoint: Path | None,
         progress: Progress | None,
         previews: Path | None,
+        table: float | None,
     ):
         self.capture, self.options, self.found = capture, options, found
+        self.views = capture.split("train")
+        doubted = any(view.doubt is not None for view in self.views)
+        self.table = table if doubted and table is not None else None
         self.checkpoint = _checkpoint.file_of(checkpoint, options, capture)
         self.progress, self.previews = progress, previews
         self.history: list[HistoryEntry] = []
@@ -207,7 +240,19 @@ class _Trainer:
         self.switch = options.iterations // 3
         self.step = make_step(options, lit=capture.is_lit)
         self.middle = 0.5 * (found.box.origin + found.box.upper)
-        self.pixel = pixel_at(capture.split("train"), self.middle)
+        self.pixel = pixel_at(self.views, self.middle)
+        if self.table is not None:
+            # What one photograph alone takes away is left to colours.
+            hull = hull_distance(self.views, found.box, spare=spare_of(len(self.views)))
+            self.found = found._replace(hull=hull)
+            self.views = decided_by_colours(self.views, self.table, Solid(found.box, hull), masks_stay=True)
+
+    def looked_again(self, state: _State) -> None:
+        """Take what has been learned for the masks, where colours decide these."""
+        assert self.table is not None
+        solid = Solid(state.model.box, state.model.distances)
+        self.views = decided_by_colours(self.views, self.table, solid)
+        self.checked = [view.replaced(mask=silhouette(view.camera, *solid)) for view in self.checked]
 
     def sharpness(self, iteration: int, first: float) -> float:
         """Of the surface [1/m] at a step: geometric from the first blur to the last."""
@@ -255,7 +300,7 @@ class _Trainer:
         if not self.options.cavities:
             return hull
         found = find_cavities(
-            self.capture.split("train"),
+            self.views,
             self.found.hull,
             self.found.box,
             lit=self.capture.is_lit,
@@ -313,13 +358,19 @@ class _Trainer:
         """All steps, or as many as it takes."""
         state = self.started() if state is None else state
         good, best, best_score = state, state, -np.inf
+        if self.table is not None and state.iteration > 0:
+            self.looked_again(state)
         rays, spent, stopped = self._rays(state.iteration), 0.0, "finished"
         options, since = self.options, time.perf_counter()
+        again = {round(share * options.iterations) for share in _AGAIN} if self.table is not None else set()
         try:
             while state.iteration < options.iterations:
                 if state.iteration == self.switch and state.model.distance.shape != self.found.box.shape:
                     state = self.refined(state)
                     rays = self._rays(state.iteration)
+                if state.iteration in again:
+                    self.looked_again(state)
+                    rays = self._rays(state.iteration, state.model.distances)
                 begin = time.perf_counter()
                 state, loss = self.advanced(state, rays)
                 if not np.isfinite(loss):
@@ -346,18 +397,26 @@ class _Trainer:
             raise
         return (best if stopped == "geometry" else state), stopped
 
+    def unexplained(self, field: LearnedField) -> float:
+        """Share of the silhouettes that a field does not explain (see `Trained`)."""
+        some = np.unique(np.linspace(0, len(self.views) - 1, 16).round().astype(int))
+        given = self.capture.split("train")
+        return float(np.mean([unexplained_share(field, self.views[i], given[i]) for i in some]))
+
     def with_corrected_cameras(self, state: _State) -> Capture:
         """The photographs, those held out corrected by what all cameras have in common."""
         train, cameras = self.capture.split("train"), state.learned.cameras
         other = [view for view in self.capture.views if view.split != "train"]
         return Capture((*cameras.corrected(train), *cameras.corrected_lens(other)), self.capture.source)
 
-    def _rays(self, iteration: int) -> RaySet:
-        """Rays that may meet the hull: the same whenever training is resumed."""
+    def _rays(self, iteration: int, learned: np.ndarray | None = None) -> RaySet:
+        """Rays that may meet the hull, or what has been learned: the same whenever training is resumed."""
         box = self.box(iteration)
         hull = resampled(self.found.hull, self.found.box, box)
+        if learned is not None and learned.shape == hull.shape:
+            hull = np.minimum(hull, learned)
         # Wide enough that the surface can move outwards by as much as its blur.
-        return collect(self.capture.split("train"), box, hull < max(3 * box.spacing, 2 * self.pixel))
+        return collect(self.views, box, hull < max(3 * box.spacing, 2 * self.pixel))
 
     def _checked(self, state: _State, spent: float, speed: float, loss: float) -> HistoryEntry:
         """Evaluate a few held-out views and the solid."""
@@ -409,6 +468,31 @@ class _Trainer:
             HistoryEntry(int(row[0]), int(row[1]), *(float(x) for x in row[2:])) for row in stored.history
         ]
         return _State(learned, optimiser, stored.iteration, blur)
+
+
+def unexplained_share(field: LearnedField, view: View, given: View) -> float:
+    """Share of a silhouette that a field does not explain.
+
+    Where the photograph shows what is behind the object, colours tell: pixels count in which the field, or
+    what is behind where it is not, has another colour. Otherwise all in which its silhouette is not the mask.
+
+    Args:
+        field: What was learned.
+        view: A photograph, with what is behind the object if that is known.
+        given: The same with the mask that it came with.
+    """
+    drawn = field.picture(view.camera, view.light)
+    assert given.mask is not None
+    if view.behind is None:
+        return 1 - mask_iou(drawn.opacity, given.mask)
+    shown, stated = drawn.opacity > 0.5, given.mask > 0.5
+    known = np.isfinite(view.behind).all(axis=-1)
+    expected = drawn.over(np.where(known[..., None], view.behind, 0))
+    # Without the blur, letters that are a quarter of a pixel beside would count.
+    apart = np.abs(ndimage.gaussian_filter(expected - view.image, (1, 1, 0))).max(axis=-1)
+    asked = shown | stated
+    wrong = np.where(known | shown, apart > _UNLIKE, shown != stated)
+    return float(np.sum(wrong & asked) / max(np.sum(asked), 1))
 
 
 def reason_to_stop(history: Sequence[HistoryEntry], residual: float) -> Stopped | None:

@@ -14,7 +14,21 @@ import warp as wp
 from dano.engine.kernels.tables import Body, Moment, Push, StateRow
 from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
-from dano.physics.impacts import Impact, Patch, patch_of_sample, share_of_impact, stiffness_of_impact
+from dano.physics.impacts import (
+    depth_beside,
+    fall_of,
+    Impact,
+    Patch,
+    patch_of_sample,
+    Rest,
+    rest_of_sample,
+    share_left_out,
+    share_of_impact,
+    stiffness_of_impact,
+    support_of,
+    supported,
+    turning_after,
+)
 from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
 from dano.physics.pairs import (
     BodyState,
@@ -27,13 +41,13 @@ from dano.physics.pairs import (
     shrunk,
 )
 from dano.physics.point_law import friction_bound, Material, point_law, point_motion, traction
-from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.real import HALF, mat33, ONE, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, interpolated, matrix, to_wxyz, turned
 from dano.physics.samples import point_contact, position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.leaves import Distance, Solids
 from dano.physics.structures import product_of
-from dano.physics.twists import angular_part, joined, linear_part, relative_twist
+from dano.physics.twists import angular_part, joined, linear_part, relative_twist, wrench_at
 
 
 @wp.struct
@@ -79,10 +93,10 @@ def point_work(
     along = virtual.velocity - (impact.delays * share) * late.velocity
     turn = virtual.spin - (impact.delays * share) * late.spin
     motion = point_motion(point, twist.velocity, twist.spin)
-    found = traction(law, motion.rate, motion.slip + point.extra_slip)
+    found = traction(law, motion.rate, motion.slip + law.extra_slip)
     if at.is_gradual:
         bound = friction_bound(law, found.pressure)
-        found.friction = friction_near(motion.slip + point.extra_slip, bound.value, at)
+        found.friction = friction_near(motion.slip + law.extra_slip, bound.value, at)
     by_pressure = wp.dot(point.normal, along) + wp.dot(point.moment, turn)
     by_friction = wp.dot(found.friction, along + wp.cross(turn, point.arm))
     return h * point.area * (found.pressure * by_pressure + by_friction)
@@ -204,7 +218,9 @@ def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, b
             inertia = turned_inertia(matrix(q), body.inertia)
             gain = gain_of_row(body, row, h)
             ahead_falling = turned(q, row.omega + gain, h)
-            total += h * wp.dot(bar.gain, gravity) + wp.dot(bar.spin_gain, matrix(q) * gain)
+            total += h * wp.dot(bar.gain + bar.falls, gravity) + wp.dot(
+                bar.spin_gain + (HALF * h) * bar.lag, matrix(q) * gain
+            )
             total += bar.inverse_mass / body.mass + wp.ddot(bar.inverse_inertia, wp.inverse(inertia))
     return total + wp.dot(bar.ahead, ahead) + wp.dot(bar.ahead_falling, ahead_falling)
 
@@ -243,11 +259,15 @@ def impact_patch_work(
     share: real,
     h: real,
     depth: real,
+    bounce: real,
+    rests: real,
     bar: Patch,
 ) -> real:
     """⟨bar, what a sample adds to the patch of an impact⟩."""
     point = point_contact(pose, sample, d, turning, False, stiffness_share, share * h)
-    own = patch_of_sample(point.area, point.sunk, depth, point.approach, point.arm, point.normal)
+    own = patch_of_sample(
+        point.area, point.sunk, depth, point.approach, bounce, rests, point.arm, point.normal
+    )
     return (
         bar.load * own.load
         + wp.dot(bar.arm, own.arm)
@@ -264,15 +284,75 @@ def impact_work(
     patch: Patch,
     bounce: real,
     factor: real,
+    friction: real,
+    share: real,
     h: real,
+    turning: int,
     hits: bool,
+    alone: bool,
     bar: Impact,
 ) -> real:
-    """⟨bar, share and stiffness of an impact⟩."""
+    """⟨bar, share and stiffness of an impact, and how points accelerate after it⟩."""
     work = bar.share * share_of_impact(patch, bounce)
     if hits:
         work += bar.stiffness * stiffness_of_impact(first, second, patch, bounce, factor, h)
+        if alone:
+            turns = turning_after(first, second, patch, friction, share, turning)
+            work += wp.ddot(bar.turns.by_arm, turns.by_arm) + wp.dot(bar.turns.offset, turns.offset)
     return work
+
+
+@wp.func
+def rest_work(
+    first: BodyState,
+    second: BodyState,
+    pose: PairPose,
+    sample: Sample,
+    d: Distance,
+    turning: int,
+    depth: real,
+    h: real,
+    bounce: real,
+    bar: Rest,
+) -> real:
+    """⟨bar, what a sample adds to what a pair rests on⟩."""
+    point = point_contact(pose, sample, d, turning, False, ONE, ZERO)
+    fall = fall_of(first, second, depth, h)
+    own = rest_of_sample(point.depth, fall, point.approach, bounce, point.arm, point.normal)
+    sums = bar.load * own.load + bar.near * own.near + bar.depth * own.depth
+    return sums + wp.dot(bar.arm, own.arm) + wp.dot(bar.normal, own.normal)
+
+
+body_product = product_of(BodyState)
+
+
+@wp.func
+def support_work(
+    first: BodyState,
+    second: BodyState,
+    rest: Rest,
+    depth: real,
+    friction: real,
+    h: real,
+    turning: int,
+    virtual: vec6,
+    second_virtual: vec6,
+    first_bar: BodyState,
+    second_bar: BodyState,
+    depth_bar: real,
+    factor: real,
+    rests_bar: real,
+) -> real:
+    """Work of what a pair rests on along virtual velocities, and ⟨bars, bodies as they meet, their depth⟩."""
+    impulse = support_of(first, second, rest, friction, h, turning)
+    back = wrench_at(impulse, first.position - second.position)
+    work = wp.dot(impulse, virtual) - wp.dot(back, second_virtual) + depth_bar * depth_beside(rest, depth)
+    work += rests_bar * share_left_out(rest, factor)
+    return (
+        work
+        + body_product(first_bar, supported(first, impulse, h))
+        + body_product(second_bar, supported(second, -back, h))
+    )
 
 
 @wp.func
@@ -313,6 +393,6 @@ def _names_in(code: CodeType) -> set[str]:
 
 for _function in (
     point_work, distance_work, sample_distance, pair_work, facing_work, momentum_work, state_work,
-    advance_work, impact_patch_work, impact_work, late_work,
+    advance_work, impact_patch_work, impact_work, rest_work, support_work, late_work,
 ):  # fmt: skip
     need_adjoints(_function)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.assembly import presses, slip_of
+from dano.engine.kernels.assembly import presses
 from dano.engine.kernels.derivatives.adjoint import (
     after_adjoints,
     distance_work,
@@ -11,7 +11,9 @@ from dano.engine.kernels.derivatives.adjoint import (
     impact_work,
     pair_work,
     point_work,
+    rest_work,
     sample_distance,
+    support_work,
     Virtual,
 )
 from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
@@ -22,14 +24,15 @@ from dano.engine.kernels.derivatives.products import (
     scaled_body,
     scaled_leaf,
     summed_body,
+    total_body,
     total_material,
     total_pose,
 )
-from dano.engine.kernels.lanes import total, total6
-from dano.engine.kernels.near import posed, solid_of_body
+from dano.engine.kernels.lanes import total, total3, total6, total33
+from dano.engine.kernels.near import as_they_meet, facing, left_out, posed, solid_of_body
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, UNIONS
-from dano.physics.impacts import Impact, Patch
+from dano.physics.impacts import fall_of, Impact, Patch, Rest
 from dano.physics.pairs import (
     BALL,
     BodyState,
@@ -40,12 +43,12 @@ from dano.physics.pairs import (
     position_after,
     rotation_after,
 )
-from dano.physics.point_law import Material, point_motion, slip_at
-from dano.physics.real import mat33, ONE, real, vec3, ZERO
-from dano.physics.samples import position_in_solid, Sample
+from dano.physics.point_law import Material, point_motion, slip_at, slip_of
+from dano.physics.real import HALF, mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.samples import facing_area, position_in_solid, Sample, solid_normal
 from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.solids.leaves import Distance
-from dano.physics.twists import relative_twist
+from dano.physics.twists import joined, relative_twist
 
 _BALL = wp.constant(BALL)
 
@@ -60,6 +63,7 @@ class PairBar:
     timestep: real  # By h
     sink: real  # By the depth up to which predicted geometry is taken
     impact_depth: real  # By δ
+    depth_beside: real  # By the depth at which a part meets, of a pair that rests on another
     factor: real  # By F
     deepest: real  # By the depth that another part may have
     twists: Virtual  # By twists and virtual twists, of bodies on joints
@@ -112,8 +116,8 @@ def pull_patch_of_impact(
     found: FoundPair,
     pose: PairPose,
     patch_bar: Patch,
-) -> tuple[PairPose, real, real, real]:
-    """Derivatives by the pose of a pair, τ, h and δ from the patch of its impact; each lane's part."""
+) -> tuple[PairPose, real, real, real, real]:
+    """Derivatives by the pose of a pair, τ, h, δ and `left_out` from the patch of its impact, by lanes."""
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
@@ -122,7 +126,10 @@ def pull_patch_of_impact(
     share_bar = real(0.0)
     h_bar = real(0.0)
     depth_bar = real(0.0)
+    rests_bar = real(0.0)
     share_of_bar = real(0.0)
+    bounce_bar = real(0.0)
+    bounce = scene.materials[world, index.contact].bounce
     for k in range(found.first, found.end):
         where = room.where[world, k]
         if room.points[world, k].sunk > -pair.impact_depth and where.presses_back == 0:
@@ -130,9 +137,13 @@ def pull_patch_of_impact(
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-            by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, _b = wp.grad(
-                impact_patch_work
-            )(pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, patch_bar)
+            (
+                by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, by_bounce,
+                by_rests, _b,
+            ) = wp.grad(impact_patch_work)(
+                pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, bounce,
+                left_out(found, pair.factor), patch_bar,
+            )  # fmt: skip
             by_pose = pull_sample(
                 scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
             )
@@ -141,10 +152,16 @@ def pull_patch_of_impact(
             h_bar += by_h
             depth_bar += by_depth
             share_of_bar += by_share_of
+            bounce_bar += by_bounce
+            rests_bar += by_rests
     share_of_bar = total(share_of_bar)
-    if lane == 0 and bars.pairs.shape[1] > 0:
-        bars.pairs[world, found.pair].share += share_of_bar
-    return pose_bar, share_bar, h_bar, depth_bar
+    bounce_bar = total(bounce_bar)
+    if lane == 0:
+        if bars.pairs.shape[1] > 0:
+            bars.pairs[world, found.pair].share += share_of_bar
+        if bars.materials.shape[1] > 0:
+            bars.materials[world, index.contact].bounce += bounce_bar
+    return pose_bar, share_bar, h_bar, depth_bar, rests_bar
 
 
 @wp.func
@@ -181,8 +198,9 @@ def pull_points(
             linear = room.linear[world, k]
             where = room.where[world, k]
             point = room.points[world, k]
-            motion = slip_of(point, point_motion(point, twist.velocity, twist.spin))
-            at = slip_at(room.laws[world, k], motion.slip, linear.grip)
+            law = room.laws[world, k]
+            motion = slip_of(law, point_motion(point, twist.velocity, twist.spin))
+            at = slip_at(law, motion.slip, linear.grip)
             sample = scene.samples[world, where.sample]
             x = position_in_solid(pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
@@ -206,6 +224,10 @@ def pull_points(
             impact_bar.delays += by_impact.delays
             impact_bar.way += by_impact.way
             impact_bar.rest += by_impact.rest
+            impact_bar.after += by_impact.after
+            impact_bar.rests += by_impact.rests
+            impact_bar.turns.by_arm += by_impact.turns.by_arm
+            impact_bar.turns.offset += by_impact.turns.offset
             add_to_material(material_bar, by_material)
             share_bar += by_share
             h_bar += by_h
@@ -370,7 +392,9 @@ def pull_pose(
             bar.second = summed_body(bar.second, scaled_body(share, of_second))
             bar.scale += share * of_scale
             bar.timestep += share * of_h
-            if found.hits > 0 or pair.impact_depth > pair.sink:
+            if found.hits > 0 and wp.length_sq(found.support) > ZERO:
+                bar.depth_beside += share
+            elif found.hits > 0 or pair.impact_depth > pair.sink:
                 bar.impact_depth += share
             else:
                 bar.sink += share
@@ -383,6 +407,134 @@ def pull_pose(
         bar, _j = pull_facing(
             scene, bars, world, lane, index.first, index.second, a, b, found.share, toward_bar, bar
         )
+    return bar
+
+
+@wp.func
+def support_twists(found: FoundPair, twists: Virtual) -> tuple[vec6, vec6]:
+    """Virtual twists of a pair's first body against its second: as they are, and of delayed impulses."""
+    along = relative_twist(twists.first_virtual, twists.second_virtual, found.com_difference)
+    late = relative_twist(twists.first_late, twists.second_late, found.com_difference)
+    return joined(along.velocity, along.spin), joined(late.velocity, late.spin)
+
+
+@wp.func
+def pull_rest(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    world: int,
+    lane: int,
+    found: FoundPair,
+    a: BodyState,
+    b: BodyState,
+    pose: PairPose,
+    rest_bar: Rest,
+) -> tuple[PairPose, PairBar]:
+    """Derivatives by the pose with which a step begins, and by the bodies, from what a pair rests on."""
+    index = scene.pair_index[found.pair]
+    pair = scene.pairs[world, found.pair]
+    turning = scene.body_index[index.first].turning
+    bounce = scene.materials[world, index.contact].bounce
+    h = scene.timestep[world, 0]
+    fall = fall_of(a, b, pair.impact_depth, h)
+    pose_bar = PairPose()
+    bar = PairBar()
+    first_bar = vec3()
+    second_bar = vec3()
+    bounce_bar = real(0.0)
+    for k in range(found.first, found.end):
+        where = room.where[world, k]
+        if where.presses_back == 0:
+            sample = scene.samples[world, where.sample]
+            x = position_in_solid(pose, sample.point)
+            solid = leaf_at(scene, world, index.second, x)
+            d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
+            if d.value < fall and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
+                by_first, by_second, by_pose, by_sample, by_distance, _a, by_depth, by_h, by_bounce, _b = (
+                    wp.grad(rest_work)(a, b, pose, sample, d, turning, pair.impact_depth, h, bounce, rest_bar)
+                )
+                by_pose = pull_sample(
+                    scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample,
+                    by_distance,
+                )  # fmt: skip
+                add_to_pose(pose_bar, by_pose)
+                first_bar += by_first.falls
+                second_bar += by_second.falls
+                bar.impact_depth += by_depth
+                bar.timestep += by_h
+                bounce_bar += by_bounce
+    bar.first.falls = total3(first_bar)
+    bar.second.falls = total3(second_bar)
+    bar.impact_depth = total(bar.impact_depth)
+    bar.timestep = total(bar.timestep)
+    bounce_bar = total(bounce_bar)
+    if lane == 0 and bars.materials.shape[1] > 0:
+        bars.materials[world, index.contact].bounce += bounce_bar
+    return total_pose(pose_bar), bar
+
+
+@after_adjoints
+@wp.func
+def pull_support(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    bars: wp.ref[Changes],
+    world: int,
+    lane: int,
+    found: FoundPair,
+    twists: Virtual,
+    rests_bar: real,
+    bar: PairBar,
+) -> PairBar:
+    """Derivatives by bodies that fall, from those by bodies that something supports while they do.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        bars: Added to.
+        world: Which world.
+        lane: Which lane.
+        found: The pair.
+        twists: Of its bodies.
+        rests_bar: Derivative by `left_out`, of all lanes.
+        bar: Derivatives by bodies as they meet, of the first lane.
+    """
+    index = scene.pair_index[found.pair]
+    pair = scene.pairs[world, found.pair]
+    material = scene.materials[world, index.contact]
+    turning = scene.body_index[index.first].turning
+    h = scene.timestep[world, 0]
+    a = falling(room.bodies[world, index.first], found.falls)
+    b = falling(room.bodies[world, index.second], found.falls)
+    share = found.impact.part * found.impact.delays
+    before = share * (HALF + found.share)
+    late = share * (HALF * found.share * found.share)
+    (
+        by_first, by_second, rest_bar, by_depth, by_friction, by_h, _a, _b, _c, _d, _e, _f, by_factor,
+        _g,
+    ) = wp.grad(support_work)(
+        a, b, found.rest, pair.impact_depth, material.friction, h, turning,
+        before * twists.first_virtual - late * twists.first_late,
+        before * twists.second_virtual - late * twists.second_late,
+        total_body(bar.first), total_body(bar.second), total(bar.depth_beside), pair.factor, rests_bar,
+    )  # fmt: skip
+    start = found
+    start.share = ZERO
+    start.critical = -1
+    start.toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
+    pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
+    pose_bar, rests = pull_rest(scene, room, bars, world, lane, found, a, b, pose, rest_bar)
+    if lane == 0:
+        of_start = pull_pose(scene, bars, world, lane, start, a, b, pose, pose_bar, ZERO, rests.timestep)
+        bar.first = summed_body(summed_body(by_first, of_start.first), rests.first)
+        bar.second = summed_body(summed_body(by_second, of_start.second), rests.second)
+        bar.scale += of_start.scale
+        bar.timestep += by_h + of_start.timestep
+        bar.impact_depth += by_depth + rests.impact_depth
+        bar.factor += by_factor
+        if bars.materials.shape[1] > 0:
+            bars.materials[world, index.contact].friction += by_friction
     return bar
 
 
@@ -415,8 +567,7 @@ def pull_pair(
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     h = scene.timestep[world, 0]
-    a = falling(room.bodies[world, index.first], found.falls)
-    b = falling(room.bodies[world, index.second], found.falls)
+    a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
     pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
     pose_bar, share_bar, h_bar, impact_bar, twists_bar = pull_points(
         scene, room, bars, world, lane, found, pose, rebound, twists
@@ -426,6 +577,7 @@ def pull_pair(
     impact_bar.depth = total(impact_bar.depth)
     impact_bar.factor = total(impact_bar.factor)
     impact_bar.deepest = total(impact_bar.deepest)
+    rests_bar = real(0.0)
     if found.impact.share > ZERO:
         impact_bar.share = total(impact_bar.share)
         impact_bar.stiffness = total(impact_bar.stiffness)
@@ -437,29 +589,53 @@ def pull_pair(
                 share_bar += (ONE - delays) * impact_bar.way
             share_bar -= delays * h * impact_bar.rest
             h_bar += (ONE - delays * found.share) * impact_bar.rest
+            share_bar -= h * impact_bar.after
+            h_bar += (HALF - found.share) * impact_bar.after
             by_delays = impact_bar.delays - wp.max(found.share, ZERO) * impact_bar.way
             by_delays -= found.share * h * impact_bar.rest
             by_delays = total(by_delays) + found.share * moment_bar.met - moment_bar.lead
+            if wp.static(not TREES):
+                # What the pair rests on until it meets.
+                along, late = support_twists(found, twists)
+                worked = found.impact.part * wp.dot(found.support, along)
+                delayed = found.impact.part * wp.dot(found.support, late)
+                half = HALF * found.share * found.share
+                by_delays += (HALF + found.share) * worked - half * delayed
+                if lane == 0:
+                    share_bar += delays * (worked - found.share * delayed)
             if delays > ZERO:
                 impact_bar.share += by_delays
         else:
             h_bar += impact_bar.rest
         bounce = scene.materials[world, index.contact].bounce
-        by_first, by_second, patch_bar, by_bounce, by_factor, by_h, _a, _b = wp.grad(impact_work)(
-            a, b, found.patch, bounce, pair.factor, h, hits, impact_bar
-        )
+        friction = scene.materials[world, index.contact].friction
+        turning = scene.body_index[index.first].turning
+        alone = bool(False)
+        if wp.static(not TREES):
+            alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
+        impact_bar.turns.by_arm = total33(impact_bar.turns.by_arm)
+        impact_bar.turns.offset = total3(impact_bar.turns.offset)
+        (
+            by_first, by_second, patch_bar, by_bounce, by_factor, by_friction, by_share_of, by_h, _a, _b, _c,
+            _d,
+        ) = wp.grad(impact_work)(
+            a, b, found.patch, bounce, pair.factor, friction, found.share, h, turning, hits, alone, impact_bar
+        )  # fmt: skip
         impact_bar.factor += by_factor
-        by_pose, by_share, by_h_of_patch, by_depth = pull_patch_of_impact(
+        by_pose, by_share, by_h_of_patch, by_depth, by_rests = pull_patch_of_impact(
             scene, room, bars, world, lane, found, pose, patch_bar
         )
         add_to_pose(pose_bar, by_pose)
         share_bar += by_share
         h_bar += by_h_of_patch
         impact_bar.depth += total(by_depth)
+        rests_bar = total(by_rests) + total(impact_bar.rests)
         if lane == 0:
             h_bar += by_h
+            share_bar += by_share_of
             if bars.materials.shape[1] > 0:
                 bars.materials[world, index.contact].bounce += by_bounce
+                bars.materials[world, index.contact].friction += by_friction
     pose_bar = total_pose(pose_bar)
     share_bar = total(share_bar) + found.impact.delays * moment_bar.met
     h_bar = total(h_bar)
@@ -471,6 +647,10 @@ def pull_pair(
         bar.impact_depth += impact_bar.depth
         bar.factor += impact_bar.factor
         bar.deepest += impact_bar.deepest
+    if wp.static(not TREES):
+        if wp.length_sq(found.support) > ZERO:
+            bar = pull_support(scene, room, bars, world, lane, found, twists, rests_bar, bar)
+    if lane == 0:
         bar.first = falling_bar(bar.first, found.falls)
         bar.second = falling_bar(bar.second, found.falls)
     bar.twists = twists_bar

@@ -41,7 +41,14 @@ from dano.engine.kernels.derivatives.products import (
     unit_row,
     unit_vector,
 )
-from dano.engine.kernels.impacts import freed, meetings_of, moving_of, pair_slope
+from dano.engine.kernels.impacts import (
+    freed,
+    meetings_of,
+    moving_of,
+    pair_slope,
+    support_before,
+    support_delayed,
+)
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, EVERYWHERE, solve_blocks
 from dano.engine.kernels.patches import n_patches
@@ -227,12 +234,12 @@ def add_shift(
     if b >= 0:
         moved = row_change(launch, changes, world, t, index.first, direction, n).position
         moved = moved - row_change(launch, changes, world, t, index.second, direction, n).position
-        moment = wp.cross(moved, linear_part(room.wrenches[world, f]))
-        room.missing[world, direction * m + b] -= joined(vec3(), moment)
+        wrench = room.wrenches[world, f]
+        at_once = wrench + support_before(found)
+        room.missing[world, direction * m + b] -= joined(vec3(), wp.cross(moved, linear_part(at_once)))
         if found.impact.delays > ZERO:
-            room.delayed[world, direction * m + b] -= joined(
-                vec3(), (found.impact.delays * found.share) * moment
-            )
+            delayed = (found.impact.delays * found.share) * wrench + support_delayed(found)
+            room.delayed[world, direction * m + b] -= joined(vec3(), wp.cross(moved, linear_part(delayed)))
 
 
 @wp.func

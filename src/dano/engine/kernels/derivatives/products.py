@@ -33,7 +33,7 @@ loop_product = product_of(Loop)
 
 add_to_material, total_material = adding_of(Material), total_of(Material)
 add_to_pose, total_pose = adding_of(PairPose), total_of(PairPose)
-summed_body, scaled_body = sum_of(BodyState), scaled_of(BodyState)
+summed_body, scaled_body, total_body = sum_of(BodyState), scaled_of(BodyState), total_of(BodyState)
 scaled_leaf = scaled_of(Leaf)
 
 add_row = addition_of(StateRow)

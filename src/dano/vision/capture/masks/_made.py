@@ -10,10 +10,12 @@ from scipy import ndimage
 from dano.extras import NETWORKS
 from dano.fields import largest_part
 from dano.vision.capture._capture import Capture, View
-from dano.vision.capture._hull import object_box, silhouettes
+from dano.vision.capture._hull import hull_distance, object_box, silhouettes, spare_of
 from dano.vision.capture._node_grid import NodeGrid
 from dano.vision.capture._ray_set import rays_of
-from dano.vision.capture._standing import standing_masks
+from dano.vision.capture._shown import silhouette
+from dano.vision.capture.masks._decided import left_out
+from dano.vision.capture.masks._standing import standing_masks
 
 _BORDER = 0.03
 """Share of the image on each side that is taken for background."""
@@ -52,7 +54,9 @@ def with_masks(capture: Capture, network: str | Path | None = None, table: float
     """
     if all(view.mask is not None for view in capture.views):
         return capture
-    if network is None and table is not None and not all(map(is_plain, capture.views)):
+    on_table = network is None and table is not None and not all(map(is_plain, capture.views))
+    if on_table:
+        assert table is not None
         masks = standing_masks(capture.views, table)
     else:
         segment = background_mask if network is None else _Network(Path(network))
@@ -67,7 +71,25 @@ def with_masks(capture: Capture, network: str | Path | None = None, table: float
         cut_out(view.replaced(mask=view.mask * here)) if given.mask is None else given
         for given, view, here in zip(capture.views, made.views, _agreed(made), strict=True)
     ]
+    if on_table:
+        # These masks are a beginning: what colours of all photographs say goes beyond them.
+        views = [
+            view if given.mask is not None else view.replaced(doubt=left_out(view.mask, shown))
+            for view, given, shown in zip(views, capture.views, _spared(views), strict=True)
+        ]
     return Capture(views, capture.source)
+
+
+def _spared(views: Sequence[View]) -> list[np.ndarray]:
+    """Silhouettes of what all masks but a few leave."""
+    train = [view for view in views if view.split == "train"]
+    try:
+        lower, upper = object_box(train)
+        box = NodeGrid.around(lower, upper, 64)
+        solid = hull_distance(train, box, _DOUBTED, spare=spare_of(len(train)))
+    except ValueError:
+        return [np.zeros(view.image.shape[:2], np.float32) for view in views]
+    return [silhouette(view.camera, box, solid) for view in views]
 
 
 def _agreed(capture: Capture) -> list[np.ndarray]:

@@ -30,7 +30,10 @@ _ELSE = 0.05
 """Share of the pixels that show anything, such as another thing on the table."""
 
 _MOST = 4.0
-"""That one pixel says: colours of neighbours depend on each other."""
+"""That one pixel says for the object: colours of neighbours depend on each other."""
+
+_AGAINST = 1.5
+"""The same for the table: a patch of an object may have its colours."""
 
 GAUSSIAN = 1.4826
 """Standard deviation over the median of deviations, of a normal distribution."""
@@ -44,6 +47,7 @@ class Tabletop(NamedTuple):
     spacing: float  # Of the cells [m]
     least: Float[np.ndarray, "n n 5"]  # Of each of `features` around each cell, (n, n, 5)
     most: Float[np.ndarray, "n n 5"]  # The largest
+    level: Float[np.ndarray, "n n 3"]  # Colour of each cell, NaN where too few show it
     # By how much photographs differ there usually, in each channel; infinite where too few show it.
     varies: Float[np.ndarray, "n n 3"]
     gain: Float[np.ndarray, "views 3"]  # Brightness of each photograph over that of all, shape (views, 3)
@@ -80,12 +84,14 @@ class Tabletop(NamedTuple):
         varies = _median(np.abs(even - level))
         few = (np.isfinite(seen[..., 0]).sum(axis=0) < _FEWEST).reshape(_CELLS, _CELLS, 1)
         varies = np.where(few, np.inf, varies.reshape(_CELLS, _CELLS, 3))
-        level = features(np.nan_to_num(level).reshape(_CELLS, _CELLS, 3))
+        level = level.reshape(_CELLS, _CELLS, 3)
+        colours = np.where(few, np.nan, level).astype(np.float32)
+        level = features(np.nan_to_num(level))
         # Places are wrong by a cell.
         around = (3, 3, 1)
         least = ndimage.minimum_filter(np.where(few, np.inf, level), around)
         most = ndimage.maximum_filter(np.where(few, -np.inf, level), around)
-        return Tabletop(height, corner, spacing, least, most, varies, gain)
+        return Tabletop(height, corner, spacing, least, most, colours, varies, gain)
 
 
 def _median(values: Float[np.ndarray, "views *rest"]) -> Float[np.ndarray, "*rest"]:
@@ -126,11 +132,8 @@ class Behind(NamedTuple):
     def of(view: View, top: Tabletop, gain: Float[np.ndarray, "3"]) -> "Behind":
         """Where the rays of a photograph meet the table."""
         shape = view.image.shape[:2]
-        rays, eye = view.camera.rays().reshape(-1, 3), view.camera.position
-        away = (top.height - eye[2]) / np.where(rays[:, 2] < -1e-6, rays[:, 2], np.nan)
-        place = ((eye + away[:, None] * rays)[:, :2] - top.corner) / top.spacing
-        inside = (away > 0) & (place >= 0).all(axis=1) & (place <= _CELLS - 1).all(axis=1)
-        column, row = np.rint(np.where(inside[:, None], place, 0)).astype(int).T
+        place, inside = _cells(view, top)
+        column, row = np.rint(place).astype(int).T
         picture = np.clip(view.image / np.maximum(gain, 1e-3), 0, 1)
         varies = np.where(inside[:, None], top.varies[row, column], np.inf).reshape(*shape, 3)
         known = np.isfinite(varies[..., :1])
@@ -140,6 +143,25 @@ class Behind(NamedTuple):
         shown = features(picture)
         off = np.maximum(np.maximum(least - shown, shown - most), 0)
         return Behind(picture, off, (most - least)[..., :3], varies)
+
+
+def _cells(view: View, top: Tabletop) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Where the rays of all pixels meet the table [cells], and which do within its picture."""
+    rays, eye = view.camera.rays().reshape(-1, 3), view.camera.position
+    away = (top.height - eye[2]) / np.where(rays[:, 2] < -1e-6, rays[:, 2], np.nan)
+    place = ((eye + away[:, None] * rays)[:, :2] - top.corner) / top.spacing
+    inside = (away > 0) & (place >= 0).all(axis=1) & (place <= _CELLS - 1).all(axis=1)
+    return np.where(inside[:, None], place, 0), inside
+
+
+def shown_by(view: View, top: Tabletop, gain: Float[np.ndarray, "3"]) -> Float[np.ndarray, "height width 3"]:
+    """What a photograph would show of the table alone, as bright as it is; NaN where that is not known."""
+    place, inside = _cells(view, top)
+    colours = [
+        ndimage.map_coordinates(top.level[..., c], place.T[::-1], order=1, mode="nearest") for c in range(3)
+    ]
+    shown = np.where(inside[:, None], np.stack(colours, axis=1) * gain, np.nan)
+    return np.clip(shown, 0, 1).reshape(view.image.shape).astype(np.float32)
 
 
 def features(colours: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 5"]:
@@ -207,4 +229,4 @@ def evidence_of(
     of_thing, of_table = (h[place[..., 0], place[..., 1], place[..., 2]] for h in (thing, table))
     of_table = np.where(known, there.prod(axis=-1), of_table)
     ratio = ((1 - _ELSE) * of_thing + _ELSE) / ((1 - _ELSE) * of_table + _ELSE)
-    return np.clip(np.log(ratio), -_MOST, _MOST)
+    return np.clip(np.log(ratio), -_AGAINST, _MOST)

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from dano.vision.capture._capture import View
-from dano.vision.capture._cut import cut_in_two
-from dano.vision.capture._hull import LOST, viewed_ball
+from dano.vision.capture._hull import LOST, spare_of, viewed_ball
 from dano.vision.capture._node_grid import NodeGrid
-from dano.vision.capture._tabletop import (
+from dano.vision.capture.masks._cut import cut_in_two
+from dano.vision.capture.masks._tabletop import (
     Behind,
     evidence_of,
     GAUSSIAN,
@@ -68,7 +68,7 @@ _AROUND = 1.6
 _WINDOW = 0.8
 """The same of the part of a photograph."""
 
-_CARVINGS = ((False, 0.15), (False, 0.1), (True, LOST))
+_CARVINGS = ((False, 0.1), (False, 0.07), (True, LOST))
 """Times that the object is carved from outlines, which are found again around it: whether the pictures are
 fine, and the share of them that may be wrong about a point."""
 
@@ -91,7 +91,7 @@ _BORDER, _EDGE = 4.0, 0.2
 _INSIDE = 1.0
 """Evidence that a pixel well inside the solid shows the object, and one beside it not."""
 
-_SHY = 0.2
+_SHY = 0.5
 """Evidence that a pixel at the solid's rim shows table where the table is not known: rims
 were too wide so far."""
 
@@ -313,8 +313,9 @@ def _outlines(
         ndimage.binary_dilation(under, iterations=reach),
     )
     core, rim, most = ([_shown(view, box, of) for view in views] for of in solids)
+    hidden = [_shown(view, box, under) for view in views]
     top = Tabletop.of(
-        views, None if masks is None else rim, table, middle[:2] - _AROUND * side, 2 * _AROUND * side
+        views, None if masks is None else hidden, table, middle[:2] - _AROUND * side, 2 * _AROUND * side
     )
     behind = [Behind.of(view, top, gain) for view, gain in zip(views, top.gain, strict=True)]
     shown = [_shown(view, box, solid) for view in views]
@@ -403,7 +404,7 @@ def _carved(
     left = (
         (count >= _LEAST_VIEWS * len(views))
         & (of >= _LEAST_VIEWS * count)
-        & (against <= int(lost * len(views)))
+        & (against <= spare_of(len(views), lost))
     )
     parts, n = ndimage.label(left.reshape(box.shape))
     if n == 0:

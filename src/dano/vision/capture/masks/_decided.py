@@ -1,0 +1,95 @@
+"""Masks that colours decide: what a table shows behind an object is known, and tells where it ends."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from dano.vision.capture._capture import View
+from dano.vision.capture._node_grid import NodeGrid
+from dano.vision.capture._shown import silhouette
+from dano.vision.capture.masks._tabletop import shown_by, Tabletop
+
+_BAND = 0.1
+"""Half the width of the band around an outline in which colours decide, over the root of its area."""
+
+_LIKE = 0.1
+"""Difference [sRGB] from what is behind up to which a pixel may show that."""
+
+_AROUND = 1.5
+"""Half the side of the table's picture, over the longest side of the object."""
+
+
+class Solid(NamedTuple):
+    """A solid as signed distances [m] at the nodes of a box."""
+
+    box: NodeGrid
+    distance: Float[np.ndarray, "nx ny nz"]
+
+
+def decided_by_colours(
+    views: Sequence[View], table: float, solid: Solid, *, masks_stay: bool = False
+) -> list[View]:
+    """Photographs whose masks are doubted around a solid's outlines, with what the table shows there.
+
+    Args:
+        views: Photographs with masks.
+        table: Height z of the level table [m, W].
+        solid: What is known of the object so far.
+        masks_stay: Whether masks stay, and are doubted where the solid's silhouettes are larger; else these
+            silhouettes take their place.
+    """
+    shown = [silhouette(view.camera, *solid) for view in views]
+    covered = [
+        view.mask if masks_stay and view.mask is not None else share
+        for view, share in zip(views, shown, strict=True)
+    ]
+    # What few photographs take for the object hides nothing: its colours are outvoted.
+    hidden = [(a > 0.5) & (b > 0.5) for a, b in zip(shown, covered, strict=True)]
+    nodes = np.argwhere(solid.distance < 0)
+    low, high = (solid.box.origin + solid.box.spacing * edge for edge in (nodes.min(0), nodes.max(0)))
+    middle, half = 0.5 * (low + high)[:2], _AROUND * float((high - low).max())
+    top = Tabletop.of(views, hidden, table, middle - half, 2 * half)
+    found = []
+    for view, mask, share, gain in zip(views, covered, shown, top.gain, strict=True):
+        behind = shown_by(view, top, gain)
+        doubt = _around(mask > 0.5) | ((share > 0.5) & (mask < 0.5)) | _like(view, behind)
+        found.append(
+            view.replaced(mask=mask.astype(np.float32), behind=behind, doubt=doubt.astype(np.float32))
+        )
+    return found
+
+
+def _like(view: View, behind: np.ndarray) -> Bool[np.ndarray, "height width"]:
+    """Where a photograph shows what is behind the object, as through a hole, or looks like that."""
+    apart = np.abs(np.nan_to_num(behind, nan=9.0) - view.image).max(axis=-1)
+    return ndimage.binary_opening(ndimage.gaussian_filter(apart, 0.7) < _LIKE)
+
+
+def _around(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """The band around an outline."""
+    if not inside.any() or inside.all():
+        return np.zeros(inside.shape, bool)
+    reach = max(2.0, _BAND * float(np.sqrt(inside.sum())))
+    return (
+        np.where(inside, ndimage.distance_transform_edt(inside), ndimage.distance_transform_edt(~inside))
+        <= reach
+    )
+
+
+def left_out(
+    mask: Float[np.ndarray, "height width"], shown: Float[np.ndarray, "height width"]
+) -> Float[np.ndarray, "height width"]:
+    """1 where a mask leaves out what most others show: parts that are more than a rim, and holes.
+
+    Args:
+        mask: Of a photograph.
+        shown: Silhouette of what most masks leave.
+    """
+    inside, covered = mask > 0.5, shown > 0.5
+    missing = covered & ~inside
+    parts = ndimage.binary_dilation(ndimage.binary_opening(missing)) & missing
+    holes = ndimage.binary_fill_holes(inside) & missing
+    return (parts | holes).astype(np.float32)
