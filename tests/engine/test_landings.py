@@ -1,4 +1,4 @@
-"""Landings of blocks without rebound, against rigid bodies in closed form, and what derivatives make of them."""
+"""Landings of blocks without rebound, against rigid bodies in closed form; derivatives of a toss."""
 
 import dataclasses
 

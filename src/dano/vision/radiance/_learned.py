@@ -37,8 +37,9 @@ class Doubt(NamedTuple):
 
         A rim of width δ around a disc of diameter 1 is 4 δ of its area. So silhouettes of which a share u is
         not explained are, if all of that is on one side, off by u/4: a third of which is taken for what an
-        axis has (measured with solids whose truth is known). Nobody photographs what an object stands on,
-        usually a quarter of its surface: with nothing unexplained the numbers are those of a `Doubt()`.
+        axis has (an estimate: it was compared with one solid whose truth is known). Nobody photographs what
+        an object stands on, usually a quarter of its surface: with nothing unexplained the numbers are those
+        of a `Doubt()`.
 
         Args:
             unexplained: Share of the silhouettes that the object does not explain.
