@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from dano.report import draw_tracked, write_tracking_report
 from dano.report._tracking import turned_since
 from dano.vision import Film, Overlay, Tracked
+from dano.vision.radiance import Doubt
 
 FRAMES, SIZE = 9, (40, 60)
 AXIS = np.array([0.6, 0.0, 0.8])
@@ -16,7 +17,7 @@ ANGLES = np.linspace(0, 5 * np.pi, FRAMES)
 
 def film(gray: int) -> Film:
     images = [np.full((*SIZE, 3), gray, np.uint8) for _ in range(FRAMES)]
-    nothing = [None] * FRAMES
+    nothing: list[np.ndarray | None] = [None] * FRAMES
     names = tuple(f"{i:03d}" for i in range(FRAMES))
     return Film(names, np.arange(FRAMES) / 30, images, nothing, nothing, 1, ())
 
@@ -34,15 +35,15 @@ def tracked(lost: int | None = None) -> Tracked:
     position = np.outer(ANGLES, [0.01, 0.02, 0.0])
     opacity = np.zeros((14, 20))
     opacity[4:10, 5:15] = 1.0
-    overlays = [Overlay((slice(10, 24), slice(20, 40)), opacity)] * FRAMES
+    overlays: list[Overlay | None] = [Overlay((slice(10, 24), slice(20, 40)), opacity)] * FRAMES
     status = ["tracked"] * FRAMES
     if lost is not None:
         position[lost] = orientation[lost] = covariance[lost] = np.nan
         overlays[lost], status[lost] = None, "lost"
     ones = np.ones(FRAMES)
     return Tracked(
-        np.arange(FRAMES) / 30, position, orientation, covariance, tuple(status), ones, 0.03 * ones, (),
-        np.inf, tuple(overlays), (), 1.0, ones,
+        np.arange(FRAMES) / 30, position, orientation, covariance, covariance, tuple(status), ones,
+        0.03 * ones, (), np.inf, tuple(overlays), (), 1.0, ones, Doubt(),
     )  # fmt: skip
 
 

@@ -329,7 +329,10 @@ def _repeats(held: Impacts, constants: dict[str, float]) -> list[Row]:
     if len(pairs) < 5:
         return [skipped(group, VELOCITY, f"{len(pairs)} pairs are alike")]
     # What the law says takes away that the two states are not quite the same.
-    left = simulated(held, **constants) - held.after[:, 3:]
+    left = (
+        simulated(held, friction=constants["friction"], restitution=constants["restitution"])
+        - held.after[:, 3:]
+    )
     apart = (left[pairs[:, 0]] - left[pairs[:, 1]]) / np.sqrt(2.0)
     note = f"{len(pairs)} pairs; over √2, as the error of a law that knows all but what differs"
     of_velocity = float(np.median(np.linalg.norm(apart[:, :2], axis=1)))
@@ -380,7 +383,8 @@ def picture(source: Source, folder: Path) -> Path:
 
     fitted, held = source.split("impacts.npz", Impacts.load)
     fit = identify(fitted.some(np.arange(120)))
-    after = simulated(held, **{name: float(fit.values[name]) for name in PARAMETERS})
+    friction, restitution = (float(fit.values[name]) for name in PARAMETERS)
+    after = simulated(held, friction=friction, restitution=restitution)
     seen = held.after[:, 3:]
     panels = [
         (f"{words} [{unit}]", seen[:, k], held.published[:, 4, k], after[:, k])

@@ -85,7 +85,9 @@ CASES = {
 @pytest.mark.parametrize(("theta", "v"), CASES.values(), ids=CASES)
 def test_an_impact_in_time_is_stronges_with_friction_that_follows_the_slip(theta, v):
     scene = plate()
-    after = np.asarray(dano.simulate(scene, start(scene, theta, v), STEPS).states.v[-1]) * [1, -1, 1]
+    speeds = dano.simulate(scene, start(scene, theta, v), STEPS).states.v
+    assert speeds is not None
+    after = np.asarray(speeds[-1]) * [1, -1, 1]
     expected = by_parts(theta, *v)
     # The plate turns by half a degree while it lasts, and its patch is some tenths of a millimetre wide.
     assert (np.abs(after - expected) < BOUNDS).all(), (after, expected)
@@ -97,7 +99,9 @@ def test_derivatives_of_an_impact_in_time_are_those_of_the_closed_form():
 
     def after(x):
         scene = plate(*x)
-        return dano.simulate(scene, start(scene, theta, v), STEPS).states.v[-1] * jnp.array([1.0, -1.0, 1.0])
+        speeds = dano.simulate(scene, start(scene, theta, v), STEPS).states.v
+        assert speeds is not None
+        return speeds[-1] * jnp.array([1.0, -1.0, 1.0])
 
     found = np.asarray(jax.jacfwd(after)(jnp.array([FRICTION, RESTITUTION])))
     step = 0.02

@@ -210,7 +210,9 @@ def walk(
             ".jpg", np.rint(255 * np.clip(exposed, 0, 1)).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 92]
         )
         assert ok
-        image = cv2.imdecode(coded, cv2.IMREAD_COLOR).astype(np.float32) / 255
+        decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+        assert decoded is not None
+        image = decoded.astype(np.float32) / 255
         stated = seen
         if shaken:
             pose = seen.pose.copy()

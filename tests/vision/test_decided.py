@@ -106,13 +106,16 @@ def test_what_the_table_shows_behind_is_known_from_the_other_photographs():
     found = decided_by_colours(views, 0.0, Solid(box, solid))
     for i in (0, 5):
         view, empty = found[i], photograph(views[i].camera, None)[0] / 255
-        known = np.isfinite(view.behind).all(axis=-1)
-        hidden = known & (views[i].mask > 0.5)
+        mask = views[i].mask
+        assert view.behind is not None and view.mask is not None and view.doubt is not None
+        assert mask is not None
+        known = np.all(np.isfinite(view.behind), axis=-1)
+        hidden = known & (mask > 0.5)
         # Half of what the box hides in one photograph is seen in others, as bright as this one is.
-        assert hidden.sum() > 0.3 * views[i].mask.sum()
+        assert hidden.sum() > 0.3 * mask.sum()
         off = np.abs(view.behind - (0.8 + 0.04 * (i % 5)) * empty)[hidden]
         assert np.median(off) < 0.03
-        overlap = np.sum((view.mask > 0.5) & (views[i].mask > 0.5)) / np.sum(views[i].mask > 0.5)
+        overlap = np.sum((view.mask > 0.5) & (mask > 0.5)) / np.sum(mask > 0.5)
         assert overlap > 0.97
         # Doubted around outlines only.
         assert 0.1 < view.doubt.sum() / view.mask.sum() < 1

@@ -68,6 +68,7 @@ def test_a_film_from_the_hand_is_as_from_a_tripod():
     blobs = np.linspace(-0.12, 0.12, FRAMES)
     moving = film([seen(camera, blob) for camera, blob in zip(cameras, blobs, strict=True)])
     found = steady_film(moving, CAMERA)
+    assert found.turns is not None
     for camera, turn in zip(cameras, found.turns, strict=True):
         # Directions in the first camera's axes, to those in the turned one's.
         own = Rotation.from_quat(np.roll(turn, -1)).as_matrix()

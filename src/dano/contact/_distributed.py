@@ -251,7 +251,7 @@ def materials(
         column([law.stiction_velocity for law in laws]),
         column([law.implicitness for law in laws]) * timestep,
         xp.broadcast_to(timestep, (n,)),
-        np.repeat([0.0 if law.compliant else 1.0 for law in laws], sizes).astype(timestep.dtype),
+        xp.asarray(np.repeat([0.0 if law.compliant else 1.0 for law in laws], sizes), timestep.dtype),
         xp.maximum(stacked.restitution_velocity + gravity * timestep, settling),
         xp.broadcast_to(_SLOW**2 * strength, (n,)).astype(timestep.dtype),
         column([law.gradual_stiction for law in laws]),

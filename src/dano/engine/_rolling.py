@@ -69,7 +69,7 @@ def _prepared(engine: Any, scene: Scene) -> Any:
     with jax.ensure_compile_time_eval():
         prepared = engine.prepare(scene)
     while len(_KEPT) >= _MOST:
-        _KEPT.pop(next(iter(_KEPT), None), None)
+        _KEPT.pop(next(iter(_KEPT)), None)
     _KEPT[key] = weakref.ref(scene, lambda _: _KEPT.pop(key, None)), prepared
     return prepared
 

@@ -160,7 +160,9 @@ def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
         _stacked([leaf.rotation for leaf in leaves]),
         *(_stacked([numbers[name].astype(dtype) for numbers in own]) for name in zero),
     ]
-    kinds, coefficients, bounds, at, first_bound = [], [np.zeros(0, dtype)], [np.zeros(0, dtype)], 0, 0
+    kinds, at, first_bound = [], 0, 0
+    coefficients: list[AnyArray] = [np.zeros(0, dtype)]
+    bounds: list[AnyArray] = [np.zeros(0, dtype)]
     for leaf in leaves:
         kind = (kind_number(leaf.leaf.kind), 0, 0, 0, 0, 0, 0)
         if isinstance(leaf.field, SignedDistanceGrid | GridField):

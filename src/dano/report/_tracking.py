@@ -158,7 +158,8 @@ def _curves(tracked: Tracked) -> str:
         ("turned by [°]", np.degrees(turned), np.degrees(turn_spread)),
     )
     half = 0.5 * float(np.median(np.diff(tracked.times)))
-    for axes, (label, values, errors) in zip(figure.subplots(2, 1, sharex=True), curves, strict=True):
+    panels = figure.subplots(2, 1, sharex=True)
+    for axes, (label, values, errors) in zip(panels, curves, strict=True):
         for k, (name, colour) in enumerate(_AXES.items()):
             low, high = (values[:, k] + sign * _BAND * errors[:, k] for sign in (-1, 1))
             axes.fill_between(tracked.times, low, high, color=colour, alpha=0.2, linewidth=0)
@@ -167,7 +168,7 @@ def _curves(tracked: Tracked) -> str:
             axes.axvspan(time - half, time + half, color="0.85", linewidth=0)
         axes.set_ylabel(label)
         axes.legend(loc="upper left", fontsize="small")
-    axes.set_xlabel("time [s]")
+    panels[-1].set_xlabel("time [s]")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return png(buffer.getvalue(), 2 * WIDTH)

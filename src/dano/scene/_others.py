@@ -62,7 +62,7 @@ class Pairs(Sequence[tuple[int, int]]):
         return first, second
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        return map(tuple, self.array.tolist())
+        return ((first, second) for first, second in self.array.tolist())
 
     def __eq__(self, other: object) -> bool:
         if isinstance(other, Pairs):

@@ -88,6 +88,7 @@ def patch_pairs(scene: Scene) -> list[PatchPair]:
     for contact in contacts:
         a, b = colliders(scene.bodies, contact, still, rotations)
         first, second = scene.index(contact.a), scene.index(contact.b)
+        assert isinstance(contact.law, AbstractPatchLaw)
         found.append(PatchPair(first, second, a, b, contact.params, contact.law))
     return found
 

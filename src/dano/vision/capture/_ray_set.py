@@ -152,7 +152,7 @@ def _told(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     if view.doubt is None or not view.doubt.any():
         return colour, np.zeros_like(view.mask), plain, np.ones(view.mask.shape, bool)
     behind = view.known_behind
-    known = np.isfinite(behind).all(axis=-1)
+    known = np.all(np.isfinite(behind), axis=-1)
     behind, doubt = np.where(known[..., None], behind, plain), view.doubt[..., None]
     if not view.cut_out:
         free = view.image - (1 - view.mask[..., None]) * behind

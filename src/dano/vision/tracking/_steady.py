@@ -244,9 +244,11 @@ class _Compared:
         """The turn near a given one with which a picture differs least from the known one."""
         smooth, (h, w) = ndimage.gaussian_filter(gray, self._blur), gray.shape
         jacobian = np.einsum("ni,nij->nj", self._slope, self._flow)
+        away = weight = np.zeros(len(self._known))
+        noise, cost = _NOISE, np.inf
         for _ in range(_STEPS):
             at = self._at(turn, rate) - 0.5
-            inside = np.isfinite(at).all(axis=1) & (at >= 0).all(axis=1) & (at <= [w - 1, h - 1]).all(axis=1)
+            inside = np.all(np.isfinite(at) & (at >= 0) & (at <= [w - 1, h - 1]), axis=1)
             place = np.where(inside[:, None], at, 0)[:, ::-1].T
             seen = ndimage.map_coordinates(smooth, place, order=1)
             # A camera's exposure follows what it sees.

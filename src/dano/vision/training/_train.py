@@ -486,7 +486,7 @@ def unexplained_share(field: LearnedField, view: View, given: View) -> float:
     if view.behind is None:
         return 1 - mask_iou(drawn.opacity, given.mask)
     shown, stated = drawn.opacity > 0.5, given.mask > 0.5
-    known = np.isfinite(view.behind).all(axis=-1)
+    known = np.all(np.isfinite(view.behind), axis=-1)
     expected = drawn.over(np.where(known[..., None], view.behind, 0))
     # Without the blur, letters that are a quarter of a pixel beside would count.
     apart = np.abs(ndimage.gaussian_filter(expected - view.image, (1, 1, 0))).max(axis=-1)

@@ -74,10 +74,16 @@ def with_masks(capture: Capture, network: str | Path | None = None, table: float
     if on_table:
         # These masks are a beginning: what colours of all photographs say goes beyond them.
         views = [
-            view if given.mask is not None else view.replaced(doubt=left_out(view.mask, shown))
+            view if given.mask is not None else _doubted(view, shown)
             for view, given, shown in zip(views, capture.views, _spared(views), strict=True)
         ]
     return Capture(views, capture.source)
+
+
+def _doubted(view: View, shown: np.ndarray) -> View:
+    """A view whose mask is doubted where a hull with photographs to spare says otherwise."""
+    assert view.mask is not None
+    return view.replaced(doubt=left_out(view.mask, shown))
 
 
 def _spared(views: Sequence[View]) -> list[np.ndarray]:
