@@ -88,10 +88,10 @@ def test_where_contact_is_sharp():
     box, rounded = dano.Box((0.05,) * 3), dano.Box((0.05,) * 3, rounding=0.005)
     for shape in (box, cylinder):
         sharp = params(shape)
-        assert float(sharp.impact_depth) == pytest.approx(9.81e-6)
+        # A millionth of the size, at any step.
+        assert float(sharp.impact_depth) == pytest.approx(1e-7, rel=0.01)
         assert float(sharp.stiffness) > 20 * float(params(ball).stiffness)
-    assert float(params(box, timestep=1e-4).impact_depth) == pytest.approx(1e-6, rel=0.01)
-    assert float(params(box, timestep=1e-2).impact_depth) == pytest.approx(5e-4, rel=0.01)
+    assert float(params(box, timestep=1e-2).impact_depth) == float(params(box).impact_depth)
     for soft in (params(rounded), params(ball), params(box, dano.DistributedLaw(compliant=True))):
         assert float(soft.impact_depth) == pytest.approx(5e-4, rel=0.01)
         assert float(soft.stiffness) < float(params(box).stiffness) / 20
