@@ -159,6 +159,7 @@ class Setting(NamedTuple):
             orientation, sinks by at most a share of its size.
         timestep: h [s].
         sharp: Whether edges and faces of both bodies are known exactly.
+        on_fixed: Whether both are shapes, and one is fixed.
     """
 
     size: float | Float[np.ndarray, " n"]
@@ -166,6 +167,7 @@ class Setting(NamedTuple):
     stiffness: Callable[[float], AnyArray]
     timestep: Float[Array, ""]
     sharp: bool
+    on_fixed: bool
 
 
 class AbstractContactLaw(eqx.Module):

@@ -129,7 +129,9 @@ def prepared(
         a, b = by_name[contact.a], by_name[contact.b]
         stiffness = functools.partial(_stiffness, a, b, weight, carried)
         size = min(sizes[a.name], sizes[b.name])
-        setting = Setting(size, strength, stiffness, timestep, flat[a.name] and flat[b.name])
+        shapes = a.object is None and b.object is None
+        sharp, on_fixed = flat[a.name] and flat[b.name], shapes and (a.fixed or b.fixed)
+        setting = Setting(size, strength, stiffness, timestep, sharp, on_fixed)
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
     return tuple(by_name[body.name] for body in bodies), tuple(completed)

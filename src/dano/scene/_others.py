@@ -33,6 +33,7 @@ class OfEdges(NamedTuple):
 
     stiffness: Float[Array, " n"]  # k [Pa/m]
     impact_depth: Float[Array, " n"]  # δ [m]
+    stiffness_on_fixed: Float[Array, " n"]  # k of shapes of which one is fixed [Pa/m]
 
 
 class Pairs(Sequence[tuple[int, int]]):
@@ -89,6 +90,8 @@ class Others(eqx.Module):
         law: Of all these pairs.
         pairs: Indices of the bodies of each pair (static).
         flat: Whether edges and faces of each body are known (static).
+        shapes: Whether each is a shape and no neural object (static).
+        fixed: Whether each is fixed (static).
     """
 
     params: ContactParams
@@ -96,6 +99,8 @@ class Others(eqx.Module):
     law: DistributedLaw
     pairs: Pairs = eqx.field(static=True)
     flat: tuple[bool, ...] = eqx.field(static=True)
+    shapes: tuple[bool, ...] = eqx.field(static=True)
+    fixed: tuple[bool, ...] = eqx.field(static=True)
 
     @property
     def pair_params(self) -> ContactParams:
@@ -112,8 +117,13 @@ class Others(eqx.Module):
         if not sharp.any():
             return found
         xp = library(*jax.tree.leaves((self.params, self.of_edges)))
-        k, depth = self.of_edges
-        stiffness = xp.where(sharp, xp.maximum(k[first], k[second]), found.stiffness)
+        k, depth, on_fixed = self.of_edges
+        shapes, fixed = np.array(self.shapes), np.array(self.fixed)
+        hard = shapes[first] & shapes[second] & (fixed[first] | fixed[second])
+        of_edges = xp.where(
+            hard, xp.maximum(on_fixed[first], on_fixed[second]), xp.maximum(k[first], k[second])
+        )
+        stiffness = xp.where(sharp, of_edges, found.stiffness)
         depth = xp.where(sharp, xp.minimum(depth[first], depth[second]), found.impact_depth)
         return eqx.tree_at(lambda p: (p.stiffness, p.impact_depth), found, (stiffness, depth))
 
@@ -168,7 +178,9 @@ def others_of(
     bodies = tuple(prepared.get(i, body) for i, body in enumerate(bodies))
     flat = are_flat(bodies)
     complete, of_edges = _stacked(bodies, touching, flat, law, params, timestep, gravity)
-    return bodies, Others(complete, of_edges, law, pairs, tuple(flat))
+    shapes = tuple(body.object is None for body in bodies)
+    fixed = tuple(body.fixed for body in bodies)
+    return bodies, Others(complete, of_edges, law, pairs, tuple(flat), shapes, fixed)
 
 
 def unnamed_contacts(
@@ -296,15 +308,18 @@ def _stacked(
         return _quotients(weight, np.array(every))
 
     every = functools.partial(stiffness, set(touching))
-    setting = Setting(sizes, strength, every, timestep, False)
+    setting = Setting(sizes, strength, every, timestep, False, False)
     found = _of_bodies(bodies, law, usual, setting)
     met = {i for i in touching if flat[i]}
     if len(met) < 2:
-        return found, OfEdges(found.stiffness, found.impact_depth)
+        return found, OfEdges(found.stiffness, found.impact_depth, found.stiffness)
     setting = setting._replace(stiffness=functools.partial(stiffness, met), sharp=True)
     there = _of_bodies(bodies, law, usual, setting)
+    hard = _of_bodies(bodies, law, usual, setting._replace(on_fixed=True))
     return found, OfEdges(
-        *(_where(flat, getattr(there, name), getattr(found, name)) for name in OfEdges._fields)
+        _where(flat, there.stiffness, found.stiffness),
+        _where(flat, there.impact_depth, found.impact_depth),
+        _where(flat, hard.stiffness, found.stiffness),
     )
 
 

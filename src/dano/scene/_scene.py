@@ -337,6 +337,8 @@ class Scene(eqx.Module):
         values = [getattr(params, k).at[i].set(checked_parameter(k, value)) for k, value in changes.items()]
         scene = eqx.tree_at(lambda s: [getattr(s.others.params, key) for key in changes], self, values)
         edges = {key: value for key, value in zip(changes, values, strict=True) if key in OfEdges._fields}
+        if "stiffness" in edges:
+            edges["stiffness_on_fixed"] = edges["stiffness"]
         of_edges = self.others.of_edges
         for key, value in edges.items():
             of_edges = of_edges._replace(**{key: getattr(of_edges, key).at[i].set(value[i])})
