@@ -22,9 +22,8 @@ class Prepared(eqx.Module):
     """What does not change from step to step: see `prepare`."""
 
     tables: Tables  # Of the scene
-    sound: Bool[
-        AnyArray, ""
-    ]  # Whether the numbers of the scene are in their ranges, see `dano.engine._finite`
+    # Whether the numbers of the scene are in their ranges, see `dano.engine._finite`
+    sound: Bool[AnyArray, ""]
     capacity: int = eqx.field(static=True)  # Chunks of points that a step has room for (static)
 
 

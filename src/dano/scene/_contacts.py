@@ -129,12 +129,23 @@ def prepared(
         a, b = by_name[contact.a], by_name[contact.b]
         stiffness = functools.partial(_stiffness, a, b, weight, carried)
         size = min(sizes[a.name], sizes[b.name])
-        shapes = a.object is None and b.object is None
-        sharp, on_fixed = flat[a.name] and flat[b.name], shapes and (a.fixed or b.fixed)
-        setting = Setting(size, strength, stiffness, timestep, sharp, on_fixed)
+        on_fixed = are_on_fixed(a.object is None, b.object is None, a.fixed, b.fixed)
+        setting = Setting(size, strength, stiffness, timestep, flat[a.name] and flat[b.name], on_fixed)
         contact = eqx.tree_at(lambda c: c.params, contact, contact.law.complete(contact.params, setting))
         completed.append(contact if contact.law.presses else _with_edge(contact, a, b))
     return tuple(by_name[body.name] for body in bodies), tuple(completed)
+
+
+def are_on_fixed(first: Any, second: Any, first_fixed: Any, second_fixed: Any) -> Any:
+    """Whether both bodies of a pair are shapes, of which one is fixed; or of pairs, as arrays.
+
+    Args:
+        first: Whether the first one is a shape and no neural object.
+        second: … the second.
+        first_fixed: Whether the first one is fixed.
+        second_fixed: … the second.
+    """
+    return first & second & (first_fixed | second_fixed)
 
 
 def colliders(

@@ -14,6 +14,7 @@ from dano.contact import combined, ContactParams, DistributedLaw, Setting
 from dano.maths import AnyArray, by_numpy, library, Q
 from dano.scene._bodies import alike, are_flat, Body, sizes_of
 from dano.scene._contacts import (
+    are_on_fixed,
     check_objects,
     checked_support,
     Contact,
@@ -119,7 +120,7 @@ class Others(eqx.Module):
         xp = library(*jax.tree.leaves((self.params, self.of_edges)))
         k, depth, on_fixed = self.of_edges
         shapes, fixed = np.array(self.shapes), np.array(self.fixed)
-        hard = shapes[first] & shapes[second] & (fixed[first] | fixed[second])
+        hard = are_on_fixed(shapes[first], shapes[second], fixed[first], fixed[second])
         of_edges = xp.where(
             hard, xp.maximum(on_fixed[first], on_fixed[second]), xp.maximum(k[first], k[second])
         )
