@@ -4,6 +4,7 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
+from reference_step.bodies import Bodies
 from reference_step.distances import signed_distance
 from reference_step.law import Law, laws_of, smooth_step
 from reference_step.rotations import cross_matrix
@@ -32,7 +33,8 @@ class Points(NamedTuple):
         second: Index of the body that it presses on.
         law: Parameters.
         share: τ.
-        com_difference: From the second centre of mass to the first, at the start [m].
+        com_difference: From the second centre of mass to the first [m], each where it is when impulses on it
+            take effect.
         arm: r [m], shape (n, 3).
         normal: n.
         moment: Of a unit pressure about the first centre of mass [m].
@@ -55,6 +57,8 @@ class Points(NamedTuple):
         way: Share of the step in which bodies go on as before.
         part: Share of an impact that the side carries.
         left_out: Share of a sample that rests which has no part in an impact.
+        waits: Whether impulses on the first and on the second body take effect when the bodies meet.
+        seen: The bodies with what their velocities gain until then.
     """
 
     first: int
@@ -84,6 +88,8 @@ class Points(NamedTuple):
     way: float
     part: float
     left_out: float
+    waits: tuple[bool, bool] = (False, False)
+    seen: Bodies | None = None
 
 
 def sides_of(scene):
@@ -244,12 +250,12 @@ def meetings(scene, bodies, side):
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
-    raw, bodies = bodies, bodies.falling()
-    since = -1.0 if is_alone(scene, bodies, side) else 0.0
+    raw, bodies = bodies, bodies.falling(held_of(scene, bodies, side))
+    since = 0.0 if scene.joints else -1.0
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
     falls = nears(scene, bodies, side, delta, slow)
     support, left_out = np.zeros(6), 0.0
-    if since and share < 1 and falls:
+    if is_alone(scene, bodies, side) and share < 1 and falls:
         rest = rest_of(scene, raw, side, delta)
         if rest is not None:
             near, depth, arm, normal = rest
@@ -364,6 +370,14 @@ def turns_after(scene, bodies, side, share, arm, normal):
 def is_alone(scene, bodies, side):
     """Whether one of the bodies is fixed, and the other moves freely."""
     return not scene.joints and not (bodies.moves[side.i] and bodies.moves[side.j])
+
+
+def held_of(scene, bodies, side):
+    """Which bodies others hold, shape (n,): of two that move those that hardly do."""
+    held = np.zeros(len(bodies.mass), bool)
+    if not scene.joints and not is_alone(scene, bodies, side):
+        held[[side.i, side.j]] = bodies.slow()[[side.i, side.j]]
+    return held
 
 
 def nears(scene, bodies, side, limit, slow):
@@ -486,7 +500,8 @@ def unit_rows(vectors):
 
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
-    bodies = bodies.falling() if met.falls else bodies.held()
+    start = bodies
+    bodies = bodies.falling(held_of(scene, bodies, side)) if met.falls else bodies.held()
     if met.falls:
         bodies = bodies.supported(on_bodies(bodies, side.i, side.j, met.support))
     i, j, h, share = side.i, side.j, bodies.h, met.share
@@ -529,9 +544,8 @@ def listed(scene, bodies, side, met):
     beta, stiffness = 0.0, 0.0
     if not met.lasts:
         beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
-    alone = is_alone(scene, bodies, side) and met.hits
-    delays, turns = beta * alone, (np.zeros((3, 3)), np.zeros(3))
-    if delays > 0:
+    delays, turns = beta * (met.hits and not scene.joints), (np.zeros((3, 3)), np.zeros(3))
+    if delays > 0 and is_alone(scene, bodies, side):
         load = area * weight / (area * weight).sum()
         turns = turns_after(scene, bodies, side, share, load @ arm, load @ normal)
     return Points(
@@ -539,7 +553,7 @@ def listed(scene, bodies, side, met):
         second=j,
         law=side.law,
         share=share,
-        com_difference=bodies.position[i] - bodies.position[j],
+        com_difference=start.position[i] - start.position[j],
         arm=arm[kept],
         normal=normal[kept],
         moment=moment[kept],
@@ -562,6 +576,7 @@ def listed(scene, bodies, side, met):
         way=(1 - delays) * max(share, 0) * met.hits,
         part=1.0,
         left_out=left_out,
+        seen=bodies,
     )
 
 
@@ -632,13 +647,18 @@ def halved(found):
 
 
 def together(bodies, found):
-    """Sides of bodies that touch a third one, too: their impulses do not wait for the impact."""
+    """Sides with impacts: impulses on bodies that move and touch no third one wait for it."""
     pairs = {frozenset(points[:2]) for points in found}
-    touched = Counter(k for pair in pairs for k in pair if bodies.moves[k])
-    crowded = {k for k, n in touched.items() if n > 1}
-    return [
-        points._replace(delays=0.0, way=max(points.share, 0.0))
-        if points.delays and crowded & set(points[:2])
-        else points
-        for points in found
-    ]
+    touched = Counter(k for pair in pairs for k in pair)
+    wait = [bool(bodies.moves[k]) and touched[k] == 1 for k in range(len(bodies.mass))]
+
+    def waiting(points):
+        if not points.delays:
+            return points
+        i, j = points[:2]
+        if not wait[i] and not wait[j]:
+            return points._replace(delays=0.0, way=max(points.share, 0.0))
+        x, other = (points.seen.pose(k, wait[k] * points.delays * points.share)[0] for k in (i, j))
+        return points._replace(waits=(wait[i], wait[j]), com_difference=x - other)
+
+    return [waiting(points) for points in found]

@@ -199,7 +199,12 @@ class Kinematics:
             until = p.part * p.delays * (0.5 + p.share)
             self.supports += until * on_bodies(self.bodies, p.first, p.second, p.support)
         for i in self.free:
-            waiting = [(p.delays * p.share, p.delays) for p in found if p.delays > 0 and i in p[:2]]
+            waiting = [
+                (p.delays * p.share, p.delays)
+                for p in found
+                for k, waits in zip(p[:2], p.waits, strict=True)
+                if waits and k == i
+            ]
             if waiting:
                 self.met[i], self.lead[i] = np.mean(waiting, axis=0) * [1, -1] + [0, 1]
 

@@ -94,8 +94,10 @@ class Step:
                 done = wrench(points, k.seen(y))
                 rests = on_bodies(k.bodies, points.first, points.second, points.support)
                 rests *= 0.5 * points.share**2 * points.part
-                for i, impulse in ((points.first, done.first), (points.second, done.second)):
-                    if i in k.free:
+                for i, impulse, waits in zip(
+                    points[:2], (done.first, done.second), points.waits, strict=True
+                ):
+                    if waits:
                         at = 6 * k.free.index(i)
                         late = points.delays * (points.share * k.h * impulse + rests[i])
                         found[at : at + 3] -= k.bodies.inverse_mass[i] * late[:3]

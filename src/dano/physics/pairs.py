@@ -70,7 +70,7 @@ class PairPose:
     spin_gained: vec3  # What gyroscopic torques have added to the spin [rad/s]
     spin_gained_on_way: vec3  # The same, in the mean over the way
     gains_after: vec3  # What the velocity of the end of the step gains from then on [m/s]
-    com_difference: vec3  # From the second body's centre of mass to the first's at the start [m, W]
+    com_difference: vec3  # See `FoundPair`, which says it: a place for derivatives by it [m, W]
     # Sample coordinates → arms from the first body's centre of mass, without their offset. Those of samples
     # that keep facing the solid are those of the start of the step.
     arms: mat33
@@ -186,6 +186,24 @@ def position_after(body: BodyState, share: real, h: real) -> vec3:
 
 
 @wp.func
+def centres_apart(
+    first: BodyState, second: BodyState, first_until: real, second_until: real, h: real
+) -> vec3:
+    """From the second body's centre of mass to the first's, each after a share of the step [m, W]."""
+    return position_after(first, first_until, h) - position_after(second, second_until, h)
+
+
+@wp.func
+def is_held(body: BodyState) -> bool:
+    """Whether a body moves by less than it falls in half a step: then others hold it."""
+    if body.inverse_mass == ZERO:
+        return False
+    radius_squared = real(3.0) * body.inverse_mass / wp.trace(body.inverse_inertia)
+    squared = wp.length_sq(body.velocity) + radius_squared * wp.length_sq(body.spin)
+    return squared < real(0.25) * wp.length_sq(body.gain)
+
+
+@wp.func
 def way_of(a: BodyState, b: BodyState, middle: vec3, radius: real, h: real) -> real:
     """Most that a point of a ball moves relative to another body within the step [m].
 
@@ -250,11 +268,11 @@ def pair_pose(
     turn = inverse * rotation_after(first, share)
     pose.com = inverse * (position_after(first, share, h) - position_after(second, share, h)) + second.com
     pose.origin = pose.com - turn * first.com
-    pose.com_difference = first.position - second.position
+    apart = first.position - second.position
     moves = first.velocity - second.velocity
-    pose.velocity = inverse * (moves - wp.cross(second.spin, pose.com_difference))
+    pose.velocity = inverse * (moves - wp.cross(second.spin, apart))
     pose.spin = inverse * (first.spin - second.spin)
-    gain = inverse * (first.gain - second.gain - wp.cross(second.spin_gain, pose.com_difference))
+    gain = inverse * (first.gain - second.gain - wp.cross(second.spin_gain, apart))
     spin_gain = inverse * (first.spin_gain - second.spin_gain)
     pose.spin_gained = (HALF + share) * spin_gain
     pose.spin_gained_on_way = spin_gain

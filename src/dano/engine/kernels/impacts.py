@@ -13,7 +13,7 @@ from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.physics.features import LANES, TREES
 from dano.physics.momentum import turned_inertia
 from dano.physics.pairs import FIXED, rotation_met
-from dano.physics.real import HALF, mat66, ONE, real, vec6, ZERO
+from dano.physics.real import HALF, mat66, ONE, real, vec3, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, wrench_at
 
 _LANES, _FIXED = wp.constant(LANES), wp.constant(FIXED)
@@ -46,10 +46,11 @@ def pair_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: Foun
 
 
 @wp.func
-def moving_of(scene: wp.ref[Scene], found: FoundPair) -> int:
-    """The body that moves of a pair of which the other is fixed."""
+def waits_on(scene: wp.ref[Scene], found: FoundPair, body: int) -> bool:
+    """Whether impulses of a pair on a body wait for when it meets the other."""
     index = scene.pair_index[found.pair]
-    return wp.where(scene.body_index[index.first].row >= 0, index.first, index.second)
+    first = found.first_waits > 0 and index.first == body
+    return found.impact.delays > ZERO and (first or (found.second_waits > 0 and index.second == body))
 
 
 @wp.func
@@ -62,11 +63,18 @@ def meetings_of(
     shares = real(0.0)
     for f in range(n_found):
         found = room.found[world, f * _LANES]
-        if found.impact.delays > ZERO and moving_of(scene, found) == body:
+        if waits_on(scene, found, body):
             count += ONE
             waits += found.impact.delays
             shares += found.impact.delays * found.share
     return count, waits, shares
+
+
+@wp.func
+def apart_at_start(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> vec3:
+    """From the second body's centre of mass to the first's when the step begins [m, W]."""
+    index = scene.pair_index[found.pair]
+    return room.bodies[world, index.first].position - room.bodies[world, index.second].position
 
 
 @wp.func
@@ -83,17 +91,16 @@ def support_delayed(found: FoundPair) -> vec6:
 
 
 @wp.func
-def push_pair_of(
-    scene: wp.ref[Scene], to: wp.array2d(dtype=vec6), world: int, found: FoundPair, impulse: vec6
-):
-    """Add an impulse on the first body of a pair to its bodies' momenta."""
+def add_support(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair):
+    """Add what a pair rests on until it meets to its bodies' momenta."""
     index = scene.pair_index[found.pair]
     a = scene.body_index[index.first].row
     b = scene.body_index[index.second].row
+    impulse = support_before(found)
     if a >= 0:
-        to[world, a] += impulse
+        room.momentum[world, a] += impulse
     if b >= 0:
-        to[world, b] -= wrench_at(impulse, found.com_difference)
+        room.momentum[world, b] -= wrench_at(impulse, apart_at_start(scene, room, world, found))
 
 
 @wp.func
@@ -105,7 +112,8 @@ def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_fou
     """
     for f in range(n_found):
         found = room.found[world, f * _LANES]
-        push_pair_of(scene, room.momentum, world, found, support_before(found))
+        if wp.length_sq(found.support) > ZERO:
+            add_support(scene, room, world, found)
     for i in range(scene.moving.shape[0]):
         body = scene.moving[i]
         count, waits, shares = meetings_of(scene, room, world, n_found, body)
@@ -135,13 +143,14 @@ def find_moved(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, 
             found = room.found[world, f * _LANES + lane]
             if found.impact.delays > ZERO:
                 impulse = (found.impact.delays * found.share) * pair_impulse(scene, room, world, found)
-                impulse += support_delayed(found)
+                held = support_delayed(found)
                 if lane == 0:
                     index = scene.pair_index[found.pair]
-                    a = scene.body_index[index.first].row
-                    b = scene.body_index[index.second].row
-                    if a >= 0:
-                        room.moved[world, a] -= freed(room, world, index.first, a, impulse)
-                    if b >= 0:
+                    if found.first_waits > 0:
+                        a = scene.body_index[index.first].row
+                        room.moved[world, a] -= freed(room, world, index.first, a, impulse + held)
+                    if found.second_waits > 0:
+                        b = scene.body_index[index.second].row
                         back = wrench_at(impulse, found.com_difference)
+                        back += wrench_at(held, apart_at_start(scene, room, world, found))
                         room.moved[world, b] += freed(room, world, index.second, b, back)

@@ -11,11 +11,13 @@ from dano.engine.kernels.meeting import Meeting, meeting
 from dano.engine.kernels.near import (
     as_they_meet,
     facing,
+    first_until,
     is_near,
     left_out,
     plane_of,
     posed,
     reach_of_block,
+    second_until,
     solid_of_body,
     stretch_of,
 )
@@ -46,7 +48,9 @@ from dano.physics.impacts import (
 )
 from dano.physics.pairs import (
     BodyState,
+    centres_apart,
     falling,
+    is_held,
     PairPose,
     speed_within,
 )
@@ -240,8 +244,7 @@ def impact_of(
         found: What is found of the pair.
         pair: The pair.
         turning: How samples turn with the first body.
-        alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
-            they meet; between two that move, this would not conserve angular momentum.
+        alone: Whether one of the bodies is fixed.
     """
     impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, material.timestep)
     if patch.load > ZERO:
@@ -250,7 +253,9 @@ def impact_of(
             impact.stiffness = stiffness_of_impact(
                 a, b, patch, material.bounce, pair.factor, material.timestep
             )
-            delays = wp.where(alone, impact.share, ZERO)
+            delays = real(0.0)
+            if wp.static(not TREES):
+                delays = impact.share
             impact = delayed(impact, delays, found.share, material.timestep)
             impact.rests = left_out(found, pair.factor)
             if alone:
@@ -337,38 +342,41 @@ def lasting_meeting(
 
 
 @wp.func
-def touches_others(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, f: int
-) -> bool:
-    """Whether the body that moves in a pair touches a third one, too."""
-    index = scene.pair_index[room.found[world, f * _LANES + lane].pair]
-    moves = index.first
-    if scene.body_index[index.first].row < 0:
-        moves = index.second
-    found = bool(False)
+def waits_for(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, body: int, other: int
+) -> int:
+    """1 where a body moves, and touches none but one other."""
+    waits = wp.where(scene.body_index[body].row >= 0, 1, 0)
     for g in range(n_found):
-        other = scene.pair_index[room.found[world, g * _LANES + lane].pair]
-        same = other.first == index.first and other.second == index.second
-        if not same and (other.first != index.second or other.second != index.first):
-            found = found or other.first == moves or other.second == moves
-    return found
+        index = scene.pair_index[room.found[world, g * _LANES + lane].pair]
+        if index.first == body and index.second != other:
+            waits = 0
+        if index.second == body and index.first != other:
+            waits = 0
+    return waits
 
 
 @wp.func
-def keep_together(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Have impulses on bodies that touch others, too, take effect all at once: at the start of the step.
+def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
+    """Have impulses of impacts take effect when bodies meet, on those that touch no others.
 
     What is pressed from two sides would else go on by what one of them does until the other begins: in a
     corner that friction jams, the two impulses have no bound.
     """
+    h = scene.timestep[world, 0]
     for f in range(n_found):
         k = f * _LANES + lane
-        if room.found[world, k].impact.delays > ZERO:
-            if touches_others(scene, room, world, lane, n_found, f):
-                found = room.found[world, k]
-                room.found[world, k].impact = delayed(
-                    found.impact, ZERO, found.share, scene.timestep[world, 0]
-                )
+        found = room.found[world, k]
+        if found.impact.delays > ZERO:
+            first = scene.pair_index[found.pair].first
+            second = scene.pair_index[found.pair].second
+            found.first_waits = waits_for(scene, room, world, lane, n_found, first, second)
+            found.second_waits = waits_for(scene, room, world, lane, n_found, second, first)
+            if found.first_waits + found.second_waits == 0:
+                found.impact = delayed(found.impact, ZERO, found.share, h)
+            a, b = as_they_meet(room.bodies[world, first], room.bodies[world, second], found, h)
+            found.com_difference = centres_apart(a, b, first_until(found), second_until(found), h)
+            room.found[world, k] = found
 
 
 @wp.func
@@ -390,8 +398,16 @@ def find_pair(
     b = room.bodies[world, index.second]
     material = scene.materials[world, index.contact]
     alone = bool(False)
+    # Others hold what hardly moves.
+    first_falls = int(1)
+    second_falls = int(1)
+    since = real(0.0)
     if wp.static(not TREES):
         alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
+        since = -ONE
+        if not alone:
+            first_falls = wp.where(is_held(a), 0, 1)
+            second_falls = wp.where(is_held(b), 0, 1)
     found = FoundPair()
     found.pair = p
     found.first = at
@@ -404,8 +420,8 @@ def find_pair(
     met = Meeting()
     if not lasts:
         met = meeting(
-            scene, room, world, lane, falling(a, 1), falling(b, 1), pair, index.first, index.second, h,
-            pair.impact_depth, slow, slow, wp.where(alone, -ONE, ZERO),
+            scene, room, world, lane, falling(a, first_falls), falling(b, second_falls), pair, index.first,
+            index.second, h, pair.impact_depth, slow, slow, since,
         )  # fmt: skip
         # What moves so slowly has no impact.
         lasts = met.slow
@@ -416,22 +432,24 @@ def find_pair(
             # What it rests on goes on to press until it meets, and says when that is.
             found.rest = find_rest(scene, room, world, lane, a, b, p)
             if found.rest.load > ZERO:
-                found.falls = 1
+                found.first_falls = 1
+                found.second_falls = 1
                 seen = falling(a, 1)
                 other = falling(b, 1)
                 found.support = support_of(seen, other, found.rest, material.friction, h, turning)
                 seen, other = as_they_meet(a, b, found, h)
                 met = meeting(
                     scene, room, world, lane, seen, other, pair, index.first, index.second, h,
-                    depth_beside(found.rest, pair.impact_depth), slow, slow, -ONE,
+                    depth_beside(found.rest, pair.impact_depth), slow, slow, since,
                 )  # fmt: skip
     after = at
     again = bool(True)
     while again:
         again = False
         found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
-        found.falls = wp.where(not lasts and met.nears, 1, 0)
-        if found.falls == 0:
+        found.first_falls = wp.where(not lasts and met.nears, first_falls, 0)
+        found.second_falls = wp.where(not lasts and met.nears, second_falls, 0)
+        if lasts or not met.nears:
             found.support = vec6()
         found.critical = met.critical
         found.share = met.share
@@ -465,7 +483,7 @@ def find_pair(
                 met = lasting_meeting(
                     scene, room, world, lane, a, b, pair, index.first, index.second, h, sink
                 )
-            again = met.share != before or found.falls > 0
+            again = met.share != before or found.first_falls + found.second_falls > 0
     seen, other = as_they_meet(a, b, found, h)
     found.toward = facing(scene, world, seen, other, index.first, index.second, found.share, h)
     found.end = wp.min(after, end)
@@ -501,7 +519,7 @@ def find_contacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
                 n_found += 1
     share_impacts(scene, room, world, lane, n_found)
     if wp.static(not TREES):
-        keep_together(scene, room, world, lane, n_found)
+        let_wait(scene, room, world, lane, n_found)
     return n_found, total(wp.where(overflow, ONE, ZERO)) > ZERO
 
 

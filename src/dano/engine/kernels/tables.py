@@ -171,7 +171,12 @@ class FoundPair:
     critical: wp.int32  # Sample that says when the bodies meet, −1 where they do not within the step
     share: real  # τ
     hits: wp.int32  # 1 where τ is when the bodies are as deep as in an impact
-    falls: wp.int32  # 1 where bodies fall freely until they meet: then gravity takes part in their way
+    # 1 where the first or the second body falls freely until they meet: then gravity takes part in its way.
+    first_falls: wp.int32
+    second_falls: wp.int32
+    # 1 where impulses of an impact on the first or the second body take effect when the bodies meet.
+    first_waits: wp.int32
+    second_waits: wp.int32
     impact: Impact  # Of the pair
     patch: Patch  # Its samples that have sunk in
     rest: Rest  # Samples that it rests on when the step begins, where it has an impact, too
@@ -179,7 +184,9 @@ class FoundPair:
     # its centre of mass [N s, N m s, W].
     support: vec6
     toward: vec3  # Direction that samples which turn face [F]
-    com_difference: vec3  # From the second body's centre of mass to the first's [m, W]
+    # From the second body's centre of mass to the first's [m, W], each where it is when impulses on it take
+    # effect.
+    com_difference: vec3
 
 
 @wp.struct

@@ -32,6 +32,7 @@ from dano.physics.impacts import (
 from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
 from dano.physics.pairs import (
     BodyState,
+    centres_apart,
     closer,
     pair_pose,
     PairPose,
@@ -145,6 +146,14 @@ def pair_work(
 ) -> real:
     """⟨bar, pose of a pair⟩."""
     return pose_product(bar, pair_pose(first, second, share, h, toward, turning, scale, follows))
+
+
+@wp.func
+def apart_work(
+    first: BodyState, second: BodyState, first_until: real, second_until: real, h: real, bar: vec3
+) -> real:
+    """⟨bar, way between the centres of mass of a pair when impulses take effect⟩."""
+    return wp.dot(bar, centres_apart(first, second, first_until, second_until, h))
 
 
 @wp.func
@@ -392,7 +401,7 @@ def _names_in(code: CodeType) -> set[str]:
 
 
 for _function in (
-    point_work, distance_work, sample_distance, pair_work, facing_work, momentum_work, state_work,
+    point_work, distance_work, sample_distance, pair_work, apart_work, facing_work, momentum_work, state_work,
     advance_work, impact_patch_work, impact_work, rest_work, support_work, late_work,
 ):  # fmt: skip
     need_adjoints(_function)

@@ -155,9 +155,9 @@ def subtract_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: i
         b = scene.body_index[index.second].row
         t = shift(found.com_difference)
         late = vec6()
-        if a >= 0:
+        if found.first_waits > 0:
             late = room.late[world, a]
-        if b >= 0:
+        if found.second_waits > 0:
             late = late - t * room.late[world, b]
         by_twist = (found.impact.delays * found.share) * (wp.transpose(slope) * late)
         if a >= 0:

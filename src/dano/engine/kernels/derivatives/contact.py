@@ -5,6 +5,7 @@ import warp as wp
 from dano.engine.kernels.assembly import presses
 from dano.engine.kernels.derivatives.adjoint import (
     after_adjoints,
+    apart_work,
     distance_work,
     facing_work,
     impact_patch_work,
@@ -28,8 +29,17 @@ from dano.engine.kernels.derivatives.products import (
     total_material,
     total_pose,
 )
+from dano.engine.kernels.impacts import apart_at_start
 from dano.engine.kernels.lanes import total, total3, total6, total33
-from dano.engine.kernels.near import as_they_meet, facing, left_out, posed, solid_of_body
+from dano.engine.kernels.near import (
+    as_they_meet,
+    facing,
+    first_until,
+    left_out,
+    posed,
+    second_until,
+    solid_of_body,
+)
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.physics.features import TREES, UNIONS
 from dano.physics.impacts import fall_of, Impact, Patch, Rest
@@ -411,10 +421,10 @@ def pull_pose(
 
 
 @wp.func
-def support_twists(found: FoundPair, twists: Virtual) -> tuple[vec6, vec6]:
+def support_twists(apart: vec3, twists: Virtual) -> tuple[vec6, vec6]:
     """Virtual twists of a pair's first body against its second: as they are, and of delayed impulses."""
-    along = relative_twist(twists.first_virtual, twists.second_virtual, found.com_difference)
-    late = relative_twist(twists.first_late, twists.second_late, found.com_difference)
+    along = relative_twist(twists.first_virtual, twists.second_virtual, apart)
+    late = relative_twist(twists.first_late, twists.second_late, apart)
     return joined(along.velocity, along.spin), joined(late.velocity, late.spin)
 
 
@@ -505,8 +515,8 @@ def pull_support(
     material = scene.materials[world, index.contact]
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
-    a = falling(room.bodies[world, index.first], found.falls)
-    b = falling(room.bodies[world, index.second], found.falls)
+    a = falling(room.bodies[world, index.first], found.first_falls)
+    b = falling(room.bodies[world, index.second], found.second_falls)
     share = found.impact.part * found.impact.delays
     before = share * (HALF + found.share)
     late = share * (HALF * found.share * found.share)
@@ -550,6 +560,7 @@ def pull_pair(
     rebound: real,
     twists: Virtual,
     moment_bar: Moment,
+    apart_bar: vec3,
 ) -> PairBar:
     """Derivatives by the states of a pair's bodies, for the first lane; adds those by all else.
 
@@ -562,18 +573,24 @@ def pull_pair(
         found: The pair.
         rebound: Share of the restitution that counts.
         twists: Of its bodies.
-        moment_bar: Derivatives by when the angular momentum of its bodies is balanced.
+        moment_bar: Derivatives by when the angular momenta of its bodies are balanced.
+        apart_bar: … by the way between their centres of mass, besides those through points.
     """
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
     h = scene.timestep[world, 0]
     a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
     pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
+    pose.com_difference = found.com_difference
     pose_bar, share_bar, h_bar, impact_bar, twists_bar = pull_points(
         scene, room, bars, world, lane, found, pose, rebound, twists
     )
     by_first = BodyState()
     by_second = BodyState()
+    of_first, of_second, by_first_until, by_second_until, by_h_apart, _e = wp.grad(apart_work)(
+        a, b, first_until(found), second_until(found), h, total3(pose_bar.com_difference) + apart_bar
+    )
+    by_until = real(found.first_waits) * by_first_until + real(found.second_waits) * by_second_until
     impact_bar.depth = total(impact_bar.depth)
     impact_bar.factor = total(impact_bar.factor)
     impact_bar.deepest = total(impact_bar.deepest)
@@ -593,10 +610,10 @@ def pull_pair(
             h_bar += (HALF - found.share) * impact_bar.after
             by_delays = impact_bar.delays - wp.max(found.share, ZERO) * impact_bar.way
             by_delays -= found.share * h * impact_bar.rest
-            by_delays = total(by_delays) + found.share * moment_bar.met - moment_bar.lead
+            by_delays = total(by_delays) + found.share * (moment_bar.met + by_until) - moment_bar.lead
             if wp.static(not TREES):
                 # What the pair rests on until it meets.
-                along, late = support_twists(found, twists)
+                along, late = support_twists(apart_at_start(scene, room, world, found), twists)
                 worked = found.impact.part * wp.dot(found.support, along)
                 delayed = found.impact.part * wp.dot(found.support, late)
                 half = HALF * found.share * found.share
@@ -637,13 +654,13 @@ def pull_pair(
                 bars.materials[world, index.contact].bounce += by_bounce
                 bars.materials[world, index.contact].friction += by_friction
     pose_bar = total_pose(pose_bar)
-    share_bar = total(share_bar) + found.impact.delays * moment_bar.met
-    h_bar = total(h_bar)
+    share_bar = total(share_bar) + found.impact.delays * (moment_bar.met + by_until)
+    h_bar = total(h_bar) + by_h_apart
     bar = PairBar()
     if lane == 0:
         bar = pull_pose(scene, bars, world, lane, found, a, b, pose, pose_bar, share_bar, h_bar)
-        bar.first = summed_body(bar.first, by_first)
-        bar.second = summed_body(bar.second, by_second)
+        bar.first = summed_body(summed_body(bar.first, by_first), of_first)
+        bar.second = summed_body(summed_body(bar.second, by_second), of_second)
         bar.impact_depth += impact_bar.depth
         bar.factor += impact_bar.factor
         bar.deepest += impact_bar.deepest
@@ -651,7 +668,7 @@ def pull_pair(
         if wp.length_sq(found.support) > ZERO:
             bar = pull_support(scene, room, bars, world, lane, found, twists, rests_bar, bar)
     if lane == 0:
-        bar.first = falling_bar(bar.first, found.falls)
-        bar.second = falling_bar(bar.second, found.falls)
+        bar.first = falling_bar(bar.first, found.first_falls)
+        bar.second = falling_bar(bar.second, found.second_falls)
     bar.twists = twists_bar
     return bar

@@ -19,7 +19,7 @@ from dano.engine.kernels.derivatives.trees import (
     pull_places,
     transpose_entries,
 )
-from dano.engine.kernels.impacts import meetings_of, moving_of
+from dano.engine.kernels.impacts import meetings_of
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, EVERYWHERE, solve_blocks
 from dano.engine.kernels.rollout import Launch, row_before
@@ -27,7 +27,7 @@ from dano.engine.kernels.settled import block_of, hangs
 from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
 from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals, solve_trees
 from dano.physics.features import LANES, PATCHES, TREES
-from dano.physics.real import ONE, vec6, ZERO
+from dano.physics.real import ONE, vec3, vec6, ZERO
 
 _LANES = wp.constant(LANES)
 
@@ -138,8 +138,9 @@ def twists_of_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: 
     twists.first_virtual = twist_of(scene, room, world, first, room.step, ZERO)
     twists.second_virtual = twist_of(scene, room, world, second, room.step, ZERO)
     if wp.static(not TREES):
-        if found.impact.delays > ZERO:
+        if found.first_waits > 0:
             twists.first_late = row_of(room.late, world, first)
+        if found.second_waits > 0:
             twists.second_late = row_of(room.late, world, second)
     return twists
 
@@ -152,18 +153,28 @@ def is_moved_pair(twists: Virtual) -> bool:
 
 
 @wp.func
+def add_moment_bar(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, body: int, bar: wp.ref[Moment]
+):
+    """Add the part that one of the pairs for which a body waits has of when its momentum is balanced."""
+    count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
+    row = scene.body_index[body].row
+    bar.met += room.moment_bar[world, row].met / count
+    bar.lead += room.moment_bar[world, row].lead / count
+
+
+@wp.func
 def moment_bar_of(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, found: FoundPair
 ) -> Moment:
-    """A pair's part of derivatives by when the angular momentum of the body that moves is balanced."""
+    """A pair's part of derivatives by when the angular momenta of its bodies are balanced."""
     bar = Moment()
     if wp.static(not TREES):
-        if found.impact.delays > ZERO:
-            body = moving_of(scene, found)
-            count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
-            row = scene.body_index[body].row
-            bar.met = room.moment_bar[world, row].met / count
-            bar.lead = room.moment_bar[world, row].lead / count
+        index = scene.pair_index[found.pair]
+        if found.first_waits > 0:
+            add_moment_bar(scene, room, world, n_found, index.first, bar)
+        if found.second_waits > 0:
+            add_moment_bar(scene, room, world, n_found, index.second, bar)
     return bar
 
 
@@ -192,7 +203,7 @@ def pull_equations(
         moment_bar = moment_bar_of(scene, room, world, n_found, found)
         if is_moved_pair(twists) or moment_bar.met != ZERO or moment_bar.lead != ZERO:
             rebound = launch.reports[world, t].rebound
-            bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)
+            bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar, vec3())
             if lane == 0:
                 pull_touching(scene, room, bars, launch, world, t, found, bar)
     if wp.static(PATCHES):

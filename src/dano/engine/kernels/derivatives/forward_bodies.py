@@ -39,18 +39,19 @@ from dano.engine.kernels.derivatives.products import (
     row_change,
     row_product,
     unit_row,
+    unit_vec3,
     unit_vector,
 )
 from dano.engine.kernels.impacts import (
     freed,
     meetings_of,
-    moving_of,
     pair_slope,
     support_before,
     support_delayed,
 )
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, EVERYWHERE, solve_blocks
+from dano.engine.kernels.near import first_until, second_until
 from dano.engine.kernels.patches import n_patches
 from dano.engine.kernels.rollout import Launch, push_of, row_before
 from dano.engine.kernels.tables import Body, Changes, FoundPair, Moment, Room, SamplePair, Scene, StateRow
@@ -178,15 +179,17 @@ def add_change(
     direction: int,
     change: real,
     k: int,
+    of_first: bool,
+    of_second: bool,
 ):
-    """Add the change of an impulse of a pair to those of its bodies."""
+    """Add the change of an impulse of a pair to those of its bodies, or of one of them."""
     m = scene.moving.shape[0]
     index = scene.pair_index[found.pair]
     a = scene.body_index[index.first].row
     b = scene.body_index[index.second].row
-    if a >= 0:
+    if a >= 0 and of_first:
         to[world, direction * m + a] += change * unit_vector(k)
-    if b >= 0:
+    if b >= 0 and of_second:
         # The second body feels −Tᵀ times the wrench on the first.
         force = linear_part(unit_vector(k))
         moment = angular_part(unit_vector(k)) + wp.cross(found.com_difference, force)
@@ -204,14 +207,19 @@ def add_meeting(
     change: real,
     of_met: bool,
 ):
-    """Add a pair's part of the change of when the angular momentum of the body that moves is balanced."""
-    body = moving_of(scene, found)
-    count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
-    at = direction * scene.moving.shape[0] + scene.body_index[body].row
-    if of_met:
-        room.moments[world, at].met += change / count
-    else:
-        room.moments[world, at].lead += change / count
+    """Add a pair's part of the change of when the angular momenta of its bodies are balanced."""
+    index = scene.pair_index[found.pair]
+    side = int(0)
+    while side < 2:
+        body = wp.where(side == 0, index.first, index.second)
+        if wp.where(side == 0, found.first_waits, found.second_waits) > 0:
+            count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
+            at = direction * scene.moving.shape[0] + scene.body_index[body].row
+            if of_met:
+                room.moments[world, at].met += change / count
+            else:
+                room.moments[world, at].lead += change / count
+        side += 1
 
 
 @wp.func
@@ -225,7 +233,10 @@ def add_shift(
     f: int,
     direction: int,
 ):
-    """Add what the change of the way between two bodies makes of the moment on the second."""
+    """Add what the change of the way between two bodies makes of the moment on the second.
+
+    That of impulses which act from the start of the step.
+    """
     n = scene.body_index.shape[0]
     m = scene.moving.shape[0]
     found = room.found[world, f * _LANES]
@@ -234,12 +245,25 @@ def add_shift(
     if b >= 0:
         moved = row_change(launch, changes, world, t, index.first, direction, n).position
         moved = moved - row_change(launch, changes, world, t, index.second, direction, n).position
-        wrench = room.wrenches[world, f]
-        at_once = wrench + support_before(found)
-        room.missing[world, direction * m + b] -= joined(vec3(), wp.cross(moved, linear_part(at_once)))
-        if found.impact.delays > ZERO:
-            delayed = (found.impact.delays * found.share) * wrench + support_delayed(found)
+        wrench = support_before(found)
+        if found.impact.delays == ZERO:
+            wrench += room.wrenches[world, f]
+        room.missing[world, direction * m + b] -= joined(vec3(), wp.cross(moved, linear_part(wrench)))
+        if found.second_waits > 0:
+            delayed = support_delayed(found)
             room.delayed[world, direction * m + b] -= joined(vec3(), wp.cross(moved, linear_part(delayed)))
+
+
+@wp.func
+def move_apart(scene: wp.ref[Scene], room: wp.ref[Room], world: int, f: int, direction: int, moved: vec3):
+    """Add what a change of `com_difference` makes of the moment of an impact on the second body."""
+    m = scene.moving.shape[0]
+    found = room.found[world, f * _LANES]
+    b = scene.body_index[scene.pair_index[found.pair].second].row
+    if b >= 0:
+        moment = joined(vec3(), wp.cross(moved, linear_part(room.wrenches[world, f])))
+        room.missing[world, direction * m + b] -= moment
+        room.delayed[world, direction * m + b] -= second_until(found) * moment
 
 
 @wp.func
@@ -327,11 +351,11 @@ def add_delayed(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int,
         b = scene.body_index[index.second].row
         t = shift(found.com_difference)
         twist = row_of(room.step, world, a) - t * row_of(room.step, world, b)
-        impulse = (found.impact.delays * found.share) * (slope * twist)
-        if a >= 0:
-            room.delayed[world, d * m + a] += impulse
-        if b >= 0:
-            room.delayed[world, d * m + b] -= wp.transpose(t) * impulse
+        impulse = slope * twist
+        if found.first_waits > 0:
+            room.delayed[world, d * m + a] += first_until(found) * impulse
+        if found.second_waits > 0:
+            room.delayed[world, d * m + b] -= second_until(found) * (wp.transpose(t) * impulse)
 
 
 @wp.func
@@ -401,8 +425,9 @@ def push_pair(
     twists.second = row_of(room.velocity, world, scene.body_index[index.second].row)
     equations = int(6)
     if found.impact.delays > ZERO:
-        # Impulses that take effect later are asked for twice, as they are and times τ_β; then what says when.
-        equations = int(14)
+        # Impulses that take effect later are asked for twice, as they are and times τ_β; then what says when,
+        # and how far apart the bodies are then.
+        equations = int(17)
     k = int(0)
     while k < equations:
         clear_pair(scene, room, bars, world, lane, found, has_points)
@@ -411,18 +436,21 @@ def push_pair(
         twists.first_virtual = vec6()
         twists.first_late = vec6()
         moment_bar = Moment()
+        apart_bar = vec3()
         if k < 6:
             twists.first_virtual = unit_vector(k)
         elif k < 12:
             twists.first_late = -unit_vector(k - 6)
         elif k == 12:
             moment_bar.met = ONE
-        else:
+        elif k == 13:
             moment_bar.lead = ONE
+        else:
+            apart_bar = unit_vec3(k - 14)
         bar = PairBar()
         if has_points:
             rebound = launch.reports[world, t].rebound
-            bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)
+            bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar, apart_bar)
         if wp.static(PATCHES):
             if not has_points:
                 bar = pull_patch(scene, room, bars, world, lane, found, twists)
@@ -433,11 +461,16 @@ def push_pair(
             change = change_of_pair(scene, room, launch, changes, bars, world, lane, t, found, has_points, d)
             if lane == 0:
                 if k < 6:
-                    add_change(scene, room.missing, world, found, d, change, k)
+                    add_change(scene, room.missing, world, found, d, change, k, True, True)
                 elif k < 12:
-                    add_change(scene, room.delayed, world, found, d, change, k - 6)
-                else:
+                    add_change(
+                        scene, room.delayed, world, found, d, change, k - 6, found.first_waits > 0,
+                        found.second_waits > 0,
+                    )  # fmt: skip
+                elif k < 14:
                     add_meeting(scene, room, world, n_found, found, d, change, k == 12)
+                else:
+                    move_apart(scene, room, world, f, d, change * unit_vec3(k - 14))
         k += 1
     if lane == 0:
         for d in range(launch.n_directions):

@@ -9,7 +9,7 @@ from dano.physics.overlap import WeightedSample
 from dano.physics.pairs import BodyState, PairPose
 from dano.physics.patch_law import PatchMaterial
 from dano.physics.point_law import Material
-from dano.physics.real import ONE, vec6
+from dano.physics.real import ONE, vec3, vec6
 from dano.physics.samples import Sample
 from dano.physics.solids.leaves import Leaf
 from dano.physics.structures import adding_of, addition_of, product_of, scaled_of, sum_of
@@ -75,5 +75,13 @@ def unit_row(k: int) -> StateRow:
 def unit_vector(k: int) -> vec6:
     """The k-th unit vector."""
     unit = vec6()
+    unit[k] = ONE
+    return unit
+
+
+@wp.func
+def unit_vec3(k: int) -> vec3:
+    """The k-th unit vector."""
+    unit = vec3()
     unit[k] = ONE
     return unit
