@@ -306,7 +306,12 @@ def find_rest(
 
 @wp.func
 def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Halve impacts that samples of both bodies have part in."""
+    """Halve impacts that samples of both bodies have part in.
+
+    Where those of one body meet when the others have not yet sunk in, it is their impact alone: they keep the
+    others from it.
+    """
+    h = scene.timestep[world, 0]
     for f in range(1, n_found):
         one = f * _LANES + lane
         other = one - _LANES
@@ -317,8 +322,17 @@ def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
                 room.found[world, one].impact.stiffness > ZERO
                 and room.found[world, other].impact.stiffness > ZERO
             ):
-                room.found[world, one].impact.part = HALF
-                room.found[world, other].impact.part = HALF
+                later = wp.where(room.found[world, one].share > room.found[world, other].share, one, other)
+                waits = h * wp.abs(room.found[world, one].share - room.found[world, other].share)
+                found = room.found[world, later]
+                impact = found.impact
+                if -waits * found.patch.near_rate > impact.depth * found.patch.near_load:
+                    room.found[world, later].impact = no_impact(
+                        impact.depth, impact.factor, impact.deepest, h
+                    )
+                else:
+                    room.found[world, one].impact.part = HALF
+                    room.found[world, other].impact.part = HALF
 
 
 @wp.func
