@@ -80,6 +80,68 @@ def test_a_corner_that_friction_jams_throws_nothing_out():
     assert np.linalg.norm(states.velocity[:, :, 0], axis=-1).max() < 1.05 * speed
 
 
+def two_boxes(gravity, *, on_floor):
+    """A box that comes down on another one, which floats or lies on a floor."""
+    bodies = [dano.Body("a", BOX, mass=0.4), dano.Body("b", dano.Box((0.06, 0.06, 0.04)), mass=0.8)]
+    params = dano.ContactParams(sliding_friction=0.3, restitution=0.3)
+    contacts = [dano.Contact("a", "b", params)]
+    if on_floor:
+        bodies.append(dano.Body("floor", dano.HalfSpace(), fixed=True))
+        contacts.append(dano.Contact("b", "floor", params))
+    return dano.Scene.create(bodies, contacts, timestep=4e-3, gravity=(0, 0, -gravity))
+
+
+def above(scene, height, speed=1.5):
+    place = dict(
+        position=jnp.stack([0.01, 0.005, height]), velocity=jnp.stack([0.1, 0.05, -jnp.asarray(speed)])
+    )
+    turn = dict(orientation=(0.12, -0.13, 0.64, 0.1), omega=(1.1, -1.6, 1.1))
+    return scene.initial_state(a=dict(**place, **turn), b=dict(position=(0, 0, 0.04)))
+
+
+@pytest.mark.parametrize("on_floor", [False, True], ids=["floats", "lies"])
+def test_where_in_a_step_two_bodies_meet_does_not_matter(on_floor):
+    """The later they meet, the longer they go on as before: where they end lies on a line."""
+    scene = two_boxes(0.0 if not on_floor else 9.81, on_floor=on_floor)
+    h, speed = float(scene.timestep), 1.5
+    heights = 0.15 + np.linspace(0, speed * h, 17)
+
+    def end(height):
+        return dano.simulate(scene, above(scene, height), n_steps=26).states.position[-1, 0]
+
+    ends = np.asarray(jax.vmap(end)(jnp.asarray(heights)))
+    before = np.asarray(jax.vmap(lambda z: above(scene, z).velocity[0])(jnp.asarray(heights)))
+    run = dano.simulate(scene, above(scene, heights[0]), n_steps=26)
+    change = np.linalg.norm(np.asarray(run.states.velocity[-1, 0]) - before[0])
+    assert change > 0.8
+    line = np.polynomial.Polynomial.fit
+    off = [np.abs(line(heights, x, 1)(heights) - x).max() for x in ends.T]
+    # If impulses acted from the start of a step, it would be about a half of h times the change.
+    assert max(off) < 0.05 * h * change
+
+
+@pytest.mark.parametrize("on_floor", [False, True], ids=["floats", "lies"])
+def test_derivatives_after_two_bodies_meet(on_floor):
+    """By friction, speed, height and the other's mass; reverse and forward mode against differences."""
+    scene = two_boxes(9.81, on_floor=on_floor)
+
+    def end(x):
+        changed = scene.replace_contact("a", "b", sliding_friction=x[0]).replace_body("b", mass=x[3])
+        states = dano.simulate(changed, above(changed, x[2], x[1]), n_steps=22).states
+        first, second = states.position[-1], 0.01 * states.velocity[-1]
+        turns = 0.02 * states.orientation[-1]
+        way = jnp.sum(first + second, axis=0) @ jnp.array([1.0, -2.0, 3.0])
+        return way + turns[0, 1] + turns[1, 2]
+
+    x = jnp.array([0.3, 1.5, 0.15, 0.8])
+    steps = 1e-6 * np.eye(4)
+    many = jax.vmap(end)
+    differences = (np.asarray(many(x[None] + steps)) - np.asarray(many(x[None] - steps))) / 2e-6
+    found = np.asarray(jax.grad(end)(x))
+    np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(jax.jacfwd(end)(x)), found, rtol=1e-5, atol=1e-9)
+
+
 @pytest.mark.parametrize("shape", [BOX, dano.Ellipsoid((0.05, 0.04, 0.03))], ids=["box", "ellipsoid"])
 def test_derivatives_after_impacts(shape):
     """By friction, speed, height and depth, against differences of a tiny step; forward mode is the same."""
