@@ -33,30 +33,53 @@ def product_of(structure: Any) -> Any:
 
 def sum_of(structure: Any) -> Any:
     """Sum of two structures."""
-    lines = [f"    a.{name} = a.{name} + b.{name}" for name, _ in plain_fields(structure)]
-    return written(structure, "summed", ["def summed(a: S, b: S) -> S:", *lines, "    return a"])
-
-
-def adding_of(structure: Any) -> Any:
-    """Add a structure to another in place: where that is one of several ways to go on, nothing is copied."""
-    lines = [f"    a.{name} += b.{name}" for name, _ in plain_fields(structure)]
-    return written(structure, "adding", ["def adding(a: wp.ref[S], b: S):", *lines])
+    return _of_fields(
+        structure, "summed", "def summed(a: S, b: S) -> S:", "a.{0} + b.{0}", "{1}(a.{0}, b.{0})", sum_of
+    )
 
 
 def scaled_of(structure: Any) -> Any:
     """A number times a structure."""
-    lines = [f"    a.{name} = a.{name} * s" for name, _ in plain_fields(structure)]
-    return written(structure, "scaled", ["def scaled(s: real, a: S) -> S:", *lines, "    return a"])
+    return _of_fields(
+        structure, "scaled", "def scaled(s: real, a: S) -> S:", "a.{0} * s", "{1}(s, a.{0})", scaled_of
+    )
+
+
+def _of_fields(structure: Any, name: str, head: str, plain: str, nested: str, inner: Any) -> Any:
+    """A function that writes each field of a structure `a` anew, and returns it.
+
+    Args:
+        structure: The structure.
+        name: Of the function.
+        head: Its first line.
+        plain: What a field of numbers becomes; {0} is its name.
+        nested: What a structure within becomes; {1} is the function for it.
+        inner: Makes that function.
+    """
+    lines, names = [], {}
+    for field, kind in fields_of(structure):
+        if _is_structure(kind):
+            names[f"inner_{field}"] = inner(kind)
+            lines.append(f"    a.{field} = {nested.format(field, f'inner_{field}')}")
+        else:
+            lines.append(f"    a.{field} = {plain.format(field)}")
+    return written(structure, name, [head, *lines, "    return a"], names)
+
+
+def adding_of(structure: Any) -> Any:
+    """Add a structure to another in place: where that is one of several ways to go on, nothing is copied."""
+    lines = [f"    a.{name} = a.{name} + b.{name}" for name in leaf_names(structure)]
+    return written(structure, "adding", ["def adding(a: wp.ref[S], b: S):", *lines])
 
 
 def addition_of(structure: Any) -> Any:
-    """Add a structure to one of an array of shape (worlds, n), which may have no columns.
+    """Add a structure of numbers to one of an array of shape (worlds, n).
 
     Lanes may add to the same one: each number is added for itself.
     """
-    lines = [f"        sums[world, i].{name} += bar.{name}" for name, _ in plain_fields(structure)]
+    lines = [f"    sums[world, i].{name} += bar.{name}" for name in leaf_names(structure)]
     head = "def add(sums: wp.array2d(dtype=S), world: int, i: int, bar: S):"
-    return written(structure, "add", [head, "    if sums.shape[1] > 0:", *lines])
+    return written(structure, "add", [head, *lines])
 
 
 def fields_of(structure: Any) -> list[tuple[str, Any]]:
@@ -65,11 +88,17 @@ def fields_of(structure: Any) -> list[tuple[str, Any]]:
     return [(name, kind) for name, kind in kinds if kind not in _OTHERS]
 
 
-def plain_fields(structure: Any) -> list[tuple[str, Any]]:
-    """Names and types of the fields of a structure that holds numbers only."""
-    found = fields_of(structure)
-    nested = [name for name, kind in found if _is_structure(kind)]
-    assert not nested, f"{structure.key} must hold numbers only, got {', '.join(nested)}"
+def leaf_names(structure: Any) -> list[str]:
+    """Names of all numbers, vectors and matrices in a structure, those of structures within as "a.b"."""
+    return list(leaf_fields(structure))
+
+
+def leaf_fields(structure: Any) -> dict[str, Any]:
+    """The same with their types."""
+    found = {}
+    for name, kind in fields_of(structure):
+        inner = leaf_fields(kind) if _is_structure(kind) else {}
+        found |= {f"{name}.{k}": x for k, x in inner.items()} or {name: kind}
     return found
 
 

@@ -12,34 +12,50 @@ from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from dano.engine.launching._launch import launch_p, merged, Plan, plan, Shape
+from dano.engine.launching._launch import launch_p, merged, Plan, plan, Shape, View
 
-CHANGING = {
-    "scene.bodies": "bodies",
-    "scene.samples": "samples",
-    "scene.solids.leaves": "leaves",
-    "scene.solids.coefficients": "coefficients",
-    "scene.pairs": "pairs",
-    "scene.materials": "materials",
-    "scene.gravity": "gravity",
-    "scene.timestep": "timestep",
-    "launch.state": "state",
-    "launch.pushes": "pushes",
-    "scene.trees.joints": "joints",
-    "scene.trees.laws": "laws",
-    "scene.trees.loops": "loops",
-    "launch.q": "q",
-    "launch.v": "v",
-    "launch.efforts": "efforts",
-    "launch.commands": "commands",
-    "scene.patches.materials": "patch_materials",
-    "scene.patches.sides": "sides",
-    "scene.patches.samples": "weighted",
-    "scene.patches.fields.parts": "parts",
+_STEP = {
+    "state": "launch.state",
+    "q": "launch.q",
+    "v": "launch.v",
+    "pushes": "launch.pushes",
+    "efforts": "launch.efforts",
+    "commands": "launch.commands",
 }
-"""Inputs by which derivatives are taken, and their names in `dano.engine.kernels.tables.Changes`."""
-
+"""What a step is given that others are not, the first numbers of `dano.engine.kernels.tables.Given`."""
+_SCENE = {
+    "bodies": "scene.bodies",
+    "leaves": "scene.solids.leaves",
+    "pairs": "scene.pairs",
+    "materials": "scene.materials",
+    "gravity": "scene.gravity",
+    "timestep": "scene.timestep",
+    "joints": "scene.trees.joints",
+    "laws": "scene.trees.laws",
+    "loops": "scene.trees.loops",
+    "patch_materials": "scene.patches.materials",
+    "sides": "scene.patches.sides",
+    "parts": "scene.patches.fields.parts",
+}
+"""What is the same for all steps: the other numbers there."""
 _COEFFICIENTS = "scene.solids.coefficients"
+_MANY = {
+    "scene.samples": "room.bars.samples",
+    "scene.patches.samples": "room.bars.weighted",
+    _COEFFICIENTS: "room.bars.coefficients",
+    "launch.pushes": "ends.pushes",
+    "launch.efforts": "ends.efforts",
+    "launch.commands": "ends.commands",
+}
+"""What is too much for each step to look at, or differs between steps: inputs, and where derivatives are."""
+_CHANGES = {
+    **{place: bars.replace("room.bars", "ends") for place, bars in _MANY.items()},
+    _COEFFICIENTS: "scene.solids.changes",
+}
+"""Where changes of these are."""
+
+CHANGING = frozenset({*_STEP.values(), *_SCENE.values(), *_MANY})
+"""Inputs by which derivatives are taken."""
 
 CHANGED = {"launch.states": "states", "launch.qs": "qs", "launch.vs": "vs"}
 """Outputs that change, and their names there."""
@@ -124,36 +140,81 @@ def _places(plan: Plan) -> dict[str, Shape]:
     return {**plan.inputs, **plan.outputs}
 
 
+def _numbers(forward: Plan) -> dict[str, tuple[str, int, Shape]]:
+    """Fields of `Given`: which input each is, where its numbers begin, and its shape in a step."""
+    n = forward.inputs["launch.state"].rows
+    k = forward.inputs["launch.q"].rows if "launch.q" in forward.inputs else 0
+    of_step = {"state": (n, 13), "pushes": (n, 6)}
+    shapes = {name: (place, Shape(*of_step.get(name, (k, 1)))) for name, place in _STEP.items()}
+    shapes |= {
+        name: (place, forward.inputs[place]) for name, place in _SCENE.items() if place in forward.inputs
+    }
+    found, at = {}, 0
+    for name, (place, shape) in shapes.items():
+        found[name] = place, at, shape
+        at += shape.rows * shape.width
+    return found
+
+
+def _in_one_row(forward: Plan, rows: dict[str, Any], n_worlds: int, dtype: Any) -> Any:
+    """Arrays by input, of shape (worlds or 1, …, rows, width), as numbers of `Given`: (worlds, …, numbers)."""
+    middle = next(iter(rows.values())).shape[1:-2] if rows else ()
+    parts = []
+    for place, _, shape in _numbers(forward).values():
+        size = shape.rows * shape.width
+        if place in rows and place not in _MANY:
+            part = rows[place].reshape(rows[place].shape[0], *middle, size)
+            parts.append(jnp.broadcast_to(part, (n_worlds, *middle, size)))
+        else:
+            parts.append(jnp.zeros((n_worlds, *middle, size), dtype))
+    return jnp.concatenate(parts, axis=-1)
+
+
+def _with_numbers(forward: Plan) -> tuple[Shape, dict[str, Shape], dict[str, View]]:
+    """The input of what a rollout is given, and outputs and views that kernels of derivatives work in."""
+    numbers = _numbers(forward)
+    row = Shape(sum(shape.rows * shape.width for _, _, shape in numbers.values()), 1)
+    views = {
+        f"room.given.{k}": View("ends.values", at, shape, "ends.bars")
+        for k, (_, at, shape) in numbers.items()
+    }
+    views |= {f"room.bars.{k}": View("ends.bars", at, shape) for k, (_, at, shape) in numbers.items()}
+    return row, {"ends.values": row, "ends.bars": row}, views
+
+
 def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
-    names = list(forward.inputs)
-    wanted = [names[i] for i in which]
-    asked = {f"bars.{CHANGED[name]}": shape for name, shape in _changed(forward).items()}
-    inputs = {**_places(forward), **asked}
-    outputs = {f"bars.{CHANGING[name]}": forward.inputs[name] for name in wanted}
+    wanted = [list(forward.inputs)[i] for i in which]
+    asked = {f"ends.{CHANGED[name]}": shape for name, shape in _changed(forward).items()}
+    row, outputs, views = _with_numbers(forward)
+    outputs |= {_MANY[name]: forward.inputs[name] for name in wanted if name in _MANY}
     return plan(
         "dano.engine.kernels.derivatives.pullback",
         "pullback",
         forward.features.but(ADJOINTS=True),
-        inputs,
+        {**_places(forward), **asked, "ends.given": row},
         outputs,
         forward.whole,
         {**forward.room, **_pulling_room(forward)},
         forward.numbers,
+        views,
     )
 
 
 def _pulling_room(forward: Plan) -> dict[str, int]:
     """Lengths of what a world needs besides for derivatives of a step's equations."""
     n = forward.room["room.bodies"]
-    room: dict[str, int] = {"room.state_bar": n, "room.after_bar": n}
-    room |= {f"room.{name}": forward.room["room.velocity"] for name in ("late", "moment_bar")}
+    room: dict[str, int] = {
+        "room.body_bars": n,
+        "room.after_bar": n,
+        "room.late": forward.room["room.velocity"],
+    }
     if "scene.patches.sides" in forward.inputs:
-        room |= {"room.patches.sums": forward.inputs["scene.patches.sides"].rows}
+        sides = forward.inputs["scene.patches.sides"].rows
+        room |= {"room.patches.sums": sides, "room.patches.sum_bars": sides}
     if "room.trees.joints" in forward.room:
         names = ("chains", "chain_bars", "hanging_bars", "asked")
         room |= {f"room.trees.{name}": forward.room["room.trees.frames"] for name in names}
-        names = ("q_bar", "v_bar", "q_after", "v_after")
-        room |= {f"room.trees.{name}": forward.room["room.trees.joints"] for name in names}
+        room |= {f"room.trees.{name}": forward.room["room.trees.joints"] for name in ("q_after", "v_after")}
     return room
 
 
@@ -172,9 +233,24 @@ def _transposed(cotangents, *inputs, plan, batched, n_worlds, which, differs, n_
             residuals[at] = jnp.broadcast_to(residuals[at][None], (n_worlds, *residuals[at].shape))
             batched[at] = True
 
+    given = _in_one_row(plan, _rows(plan, residuals, batched), n_worlds, residuals[0].dtype)[..., None]
+    numbers = {place: (at, shape) for place, at, shape in _numbers(plan).values()}
+
     def pull(bars):
-        given = (*batched, *(True for _ in bars))
-        return launch_p.bind(*residuals, *bars, plan=back, batched=given, n_worlds=n_worlds)
+        rows = [*residuals, *bars, given]
+        differ = (*batched, *(True for _ in bars), True)
+        found = dict(
+            zip(back.outputs, launch_p.bind(*rows, plan=back, batched=differ, n_worlds=n_worlds), strict=True)
+        )
+        by = []
+        for name in (list(plan.inputs)[i] for i in which):
+            if name in _MANY:
+                by.append(found[_MANY[name]])
+            else:
+                at, shape = numbers[name]
+                part = found["ends.bars"][:, at : at + shape.rows * shape.width]
+                by.append(part.reshape(n_worlds, *shape))
+        return by
 
     if n_directions == 1:
         found = [x[:, None] for x in pull([x[:, 0] for x in bars])]
@@ -231,58 +307,58 @@ def _spread(change, axis, size: int):
     return jnp.broadcast_to(change[:, None], (change.shape[0], size, *change.shape[1:]))
 
 
+def _rows(plan: Plan, inputs: Any, batched: Any) -> dict[str, Any]:
+    """Inputs of a rollout by place, with an axis of worlds, of which there is one where all are alike."""
+    rows = zip(plan.inputs, inputs, batched, strict=False)
+    return {place: x if differs else x[None] for place, x, differs in rows}
+
+
 def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) -> Plan:
-    names = list(forward.inputs)
-    chosen = {names[i]: forward.inputs[names[i]] for i in which}
-    changes = {_place_of_change(k): Shape(n_directions * x.rows, x.width) for k, x in chosen.items()}
+    chosen = [list(forward.inputs)[i] for i in which]
+    many = {name: forward.inputs[name] for name in chosen if name in _MANY}
+    row, outputs, views = _with_numbers(forward)
+    inputs = {_CHANGES[name]: Shape(n_directions * x.rows, x.width) for name, x in many.items()}
     ends = {
-        f"changes.{CHANGED[name]}": Shape(n_directions * shape.rows, shape.width)
+        f"ends.{CHANGED[name]}": Shape(n_directions * shape.rows, shape.width)
         for name, shape in _changed(forward).items()
     }
+    room = {_MANY[k]: x.rows for k, x in many.items() if k in ("scene.samples", "scene.patches.samples")}
+    if _COEFFICIENTS in many:
+        room["room.splines"] = n_directions
+    room |= {"room.along": n_directions, "room.moving": n_directions * row.rows}
+    room["room.missing"] = n_directions * forward.room["room.velocity"]
+    changes = Shape(n_directions * row.rows, 1)
     return plan(
         "dano.engine.kernels.derivatives.pushforward",
         "pushforward",
         forward.features.but(ADJOINTS=True),
-        {**_places(forward), **changes},
-        ends,
+        {**_places(forward), "ends.given": row, "ends.changes": changes, **inputs},
+        {**ends, **outputs},
         forward.whole,
-        {**forward.room, **_pushforward_room(forward, which, n_directions)},
+        {**forward.room, **_pulling_room(forward), **room},
         {**forward.numbers, "launch.n_directions": n_directions},
+        views,
     )
-
-
-def _place_of_change(place: str) -> str:
-    """Where changes of an input stand; those of coefficients are read as coefficients."""
-    return "scene.solids.changes" if place == _COEFFICIENTS else f"changes.{CHANGING[place]}"
-
-
-def _pushforward_room(forward: Plan, which: tuple[int, ...], n_directions: int) -> dict[str, int]:
-    names = [list(forward.inputs)[i] for i in which]
-    rows = {f"bars.{CHANGING[k]}": forward.inputs[k].rows for k in names if k != _COEFFICIENTS}
-    splines = {"room.splines": n_directions} if _COEFFICIENTS in names else {}
-    return {
-        **_pulling_room(forward),
-        **rows,
-        **splines,
-        **{
-            f"room.{n}": n_directions * forward.room["room.velocity"]
-            for n in ("missing", "delayed", "moments")
-        },
-        "room.wrenches": forward.room["room.found"],
-    }
 
 
 def _lowered(*inputs, plan, batched, n_worlds, which, differs, n_directions):
     n = len(plan.inputs) + len(plan.outputs)
     forward = _pushforward_plan(plan, which, n_directions)
-    changes = [
-        x.reshape(x.shape[0], -1, x.shape[-1])[slice(None) if d else 0]
-        for x, d in zip(inputs[n:], differs, strict=True)
-    ]
+    names = [list(plan.inputs)[i] for i in which]
+    changes = dict(zip(names, inputs[n:], strict=True))
+    dtype = inputs[0].dtype
+    given = _in_one_row(plan, _rows(plan, inputs, batched), n_worlds, dtype)[..., None]
+    moved = _in_one_row(plan, changes, n_worlds, dtype).reshape(n_worlds, -1, 1)
+    many = [
+        (x.reshape(x.shape[0], -1, x.shape[-1])[slice(None) if d else 0], d)
+        for (name, x), d in zip(changes.items(), differs, strict=True) if name in _MANY
+    ]  # fmt: skip
     found = launch_p.bind(
-        *inputs[:n], *changes, plan=forward, batched=(*batched, *differs), n_worlds=n_worlds
-    )
+        *inputs[:n], given, moved, *(x for x, _ in many), plan=forward,
+        batched=(*batched, True, True, *(d for _, d in many)), n_worlds=n_worlds,
+    )  # fmt: skip
     shapes = _changed(plan).values()
+    found = found[: len(shapes)]
     return [x.reshape(n_worlds, n_directions, *shape) for x, shape in zip(found, shapes, strict=True)]
 
 

@@ -4,12 +4,12 @@ import warp as wp
 
 from dano.engine.kernels.assembly import row_of, twist_of
 from dano.engine.kernels.derivatives.adjoint import after_adjoints, Virtual
-from dano.engine.kernels.derivatives.bodies import pull_advance, pull_body, pull_momentum
+from dano.engine.kernels.derivatives.bodies import pull_advance, pull_body, pull_delays, pull_momentum
 from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
 from dano.engine.kernels.derivatives.patches import pull_patch
+from dano.engine.kernels.derivatives.products import summed_body
 from dano.engine.kernels.derivatives.trees import (
     add_hanging,
-    add_timestep,
     ask_of_end,
     follow_chains,
     pull_chains,
@@ -22,14 +22,29 @@ from dano.engine.kernels.derivatives.trees import (
 from dano.engine.kernels.impacts import meetings_of, moving_of
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, EVERYWHERE, solve_blocks
-from dano.engine.kernels.rollout import Launch, row_before
+from dano.engine.kernels.rollout import Launch, push_of, row_before
 from dano.engine.kernels.settled import block_of, hangs
-from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
+from dano.engine.kernels.tables import FoundPair, Room, Scene, StateRow
 from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals, solve_trees
 from dano.physics.features import LANES, PATCHES, TREES
-from dano.physics.real import ONE, vec6, ZERO
+from dano.physics.pairs import BodyState
+from dano.physics.real import ONE, real, vec6, ZERO
 
 _LANES = wp.constant(LANES)
+
+
+@wp.func
+def take_step(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, t: int):
+    """What a step is given that others are not: its start and its controls, in `room.given`."""
+    for i in range(scene.body_index.shape[0]):
+        room.given.state[world, i] = row_before(scene, launch, world, t, i)
+        room.given.pushes[world, i] = push_of(scene, launch, world, t, i)
+    for c in range(scene.trees.coordinates.shape[0]):
+        drive = room.trees.joints[world, c].drive
+        room.given.q[world, c] = drive.q
+        room.given.v[world, c] = drive.v
+        room.given.efforts[world, c] = drive.effort
+        room.given.commands[world, c] = drive.command
 
 
 @wp.func
@@ -57,46 +72,29 @@ def is_moved(values: wp.array2d(dtype=vec6), world: int, block: int) -> bool:
     return not (wp.length_sq(values[world, block]) == ZERO)
 
 
-@after_adjoints
 @wp.func
-def pull_touching(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    launch: wp.ref[Launch],
-    world: int,
-    t: int,
-    found: FoundPair,
-    bar: PairBar,
+def add_to_body(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, bar: BodyState, twist: vec6, work: vec6
 ):
-    """Add derivatives by the two bodies of a pair."""
+    """Add derivatives by how contact sees a body, and by its twists if it is on a joint."""
+    room.body_bars[world, body] = summed_body(room.body_bars[world, body], bar)
+    row = scene.body_index[body].row
+    if hangs(scene, row):
+        add_hanging(room, world, row, twist, work)
+
+
+@wp.func
+def add_pair(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair, bar: PairBar, twists: Virtual
+):
+    """Add derivatives by what a pair with points is at the start of a step."""
     index = scene.pair_index[found.pair]
-    side = int(0)
-    while side < 2:
-        body = index.first
-        state = bar.first
-        twist = bar.twists.first
-        work = bar.twists.first_virtual
-        if side == 1:
-            body = index.second
-            state = bar.second
-            twist = bar.twists.second
-            work = bar.twists.second_virtual
-        row = scene.body_index[body].row
-        if hangs(scene, row):
-            add_hanging(room, world, row, state, twist, work)
-        else:
-            pull_body(scene, room, bars, world, body, row_before(scene, launch, world, t, body), state)
-        side += 1
-    if bars.bodies.shape[1] > 0:
-        bars.bodies[world, index.first].scale += bar.scale
-    add_timestep(bars, world, bar.timestep)
-    # Pairs with a patch stand behind those with points, and have no depth of their own.
-    if found.pair < bars.pairs.shape[1]:
-        bars.pairs[world, found.pair].sink += bar.sink
-        bars.pairs[world, found.pair].impact_depth += bar.impact_depth
-        bars.pairs[world, found.pair].factor += bar.factor
-        bars.pairs[world, found.pair].deepest += bar.deepest
+    add_to_body(scene, room, world, index.first, bar.first, twists.first, twists.first_virtual)
+    add_to_body(scene, room, world, index.second, bar.second, twists.second, twists.second_virtual)
+    room.bars.bodies[world, index.first].scale += bar.scale
+    room.bars.timestep[world, 0] += bar.timestep
+    room.bars.pairs[world, found.pair].sink += bar.sink
+    room.bars.pairs[world, found.pair].impact_depth += bar.depth
 
 
 @after_adjoints
@@ -104,26 +102,34 @@ def pull_touching(
 def pull_end(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
-    bars: wp.ref[Changes],
     launch: wp.ref[Launch],
     world: int,
+    lane: int,
     t: int,
+    n_found: int,
 ):
     """Derivatives by what a step begins with, and by its velocities, from those by its end.
 
     The latter are in `room.residual`. Chains are those without virtual velocities, see `follow_chains`.
     """
-    if wp.static(TREES):
-        clear_trees(scene, world, room.residual)
-        pull_places(scene, room, bars, launch, world, t)
-    for i in range(scene.body_index.shape[0]):
-        if not hangs(scene, scene.body_index[i].row):
-            before = row_before(scene, launch, world, t, i)
-            pull_advance(scene, room, bars, world, i, before, room.after_bar[world, i])
-    if wp.static(TREES):
-        ask_of_end(scene, room, world)
-        pull_coordinates(scene, room, bars, world)
-        pull_chains(scene, room, bars, launch, world, t)
+    if lane == 0:
+        for i in range(scene.body_index.shape[0]):
+            room.bars.state[world, i] = StateRow()
+            room.body_bars[world, i] = BodyState()
+        if wp.static(TREES):
+            clear_trees(scene, world, room.residual)
+            pull_places(scene, room, launch, world, t)
+        for i in range(scene.body_index.shape[0]):
+            if not hangs(scene, scene.body_index[i].row):
+                pull_advance(scene, room, world, i, room.after_bar[world, i])
+        if wp.static(TREES):
+            ask_of_end(scene, room, world)
+            pull_coordinates(scene, room, world)
+            pull_chains(scene, room, world)
+    wait()
+    if wp.static(not TREES):
+        pull_delays(scene, room, world, lane, n_found)
+        wait()
 
 
 @wp.func
@@ -152,19 +158,19 @@ def is_moved_pair(twists: Virtual) -> bool:
 
 
 @wp.func
-def moment_bar_of(
+def balance_bars(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, found: FoundPair
-) -> Moment:
+) -> tuple[real, real]:
     """A pair's part of derivatives by when the angular momentum of the body that moves is balanced."""
-    bar = Moment()
+    met = real(0.0)
+    lead = real(0.0)
     if wp.static(not TREES):
         if found.impact.delays > ZERO:
             body = moving_of(scene, found)
             count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
-            row = scene.body_index[body].row
-            bar.met = room.moment_bar[world, row].met / count
-            bar.lead = room.moment_bar[world, row].lead / count
-    return bar
+            met = room.body_bars[world, body].met / count
+            lead = room.body_bars[world, body].lead / count
+    return met, lead
 
 
 @after_adjoints
@@ -172,7 +178,6 @@ def moment_bar_of(
 def pull_equations(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
-    bars: wp.ref[Changes],
     launch: wp.ref[Launch],
     world: int,
     lane: int,
@@ -180,34 +185,40 @@ def pull_equations(
     n_found: int,
 ):
     """Add derivatives of −λ · R of a settled step, with virtual velocities λ in `room.step`."""
+    n = scene.body_index.shape[0]
     if lane == 0:
-        for i in range(scene.body_index.shape[0]):
+        for i in range(n):
             row = scene.body_index[i].row
             if row >= 0 and not hangs(scene, row) and is_moved(room.step, world, block_of(scene, row)):
-                pull_momentum(scene, room, bars, launch, world, t, i, row_before(scene, launch, world, t, i))
+                pull_momentum(scene, room, world, i)
     wait()
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
         twists = twists_of_pair(scene, room, world, found)
-        moment_bar = moment_bar_of(scene, room, world, n_found, found)
-        if is_moved_pair(twists) or moment_bar.met != ZERO or moment_bar.lead != ZERO:
+        met, lead = balance_bars(scene, room, world, n_found, found)
+        if is_moved_pair(twists) or met != ZERO or lead != ZERO:
             rebound = launch.reports[world, t].rebound
-            bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)
+            bar, by_twists = pull_pair(scene, room, world, lane, found, rebound, twists, met, lead)
             if lane == 0:
-                pull_touching(scene, room, bars, launch, world, t, found, bar)
+                add_pair(scene, room, world, found, bar, by_twists)
     if wp.static(PATCHES):
         for p in range(room.patches.count[world, 0]):
             touching = room.found[world, (n_found + p) * _LANES + lane]
             twists_there = twists_of_pair(scene, room, world, touching)
             if is_moved_pair(twists_there):
-                patch_bar = pull_patch(scene, room, bars, world, lane, touching, twists_there)
+                by = pull_patch(scene, room, world, lane, touching, twists_there)
                 if lane == 0:
-                    pull_touching(scene, room, bars, launch, world, t, touching, patch_bar)
+                    index = scene.pair_index[touching.pair]
+                    none = BodyState()
+                    add_to_body(scene, room, world, index.first, none, by.first, by.first_virtual)
+                    add_to_body(scene, room, world, index.second, none, by.second, by.second_virtual)
     wait()
-    if wp.static(TREES):
-        if lane == 0:
-            follow_chains(scene, room, launch, world, t)
-            pull_laws(scene, room, bars, world, t)
-            pull_loops(scene, room, bars, world)
-            pull_chains(scene, room, bars, launch, world, t)
-        wait()
+    if lane == 0:
+        if wp.static(TREES):
+            follow_chains(scene, room, world)
+            pull_laws(scene, room, world)
+            pull_loops(scene, room, world)
+            pull_chains(scene, room, world)
+        for i in range(n):
+            pull_body(scene, room, world, i)
+    wait()

@@ -7,42 +7,80 @@ the roots.
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import momentum_work, need_adjoints
-from dano.engine.kernels.tables import Body, Moment, Push, StateRow
-from dano.engine.kernels.trees.tables import Chain, HangingBar
-from dano.physics.real import ONE, real, vec3, vec4, vec6
+from dano.engine.kernels.derivatives.adjoint import momentum_gained, need_adjoints
+from dano.engine.kernels.tables import Given, StateRow
+from dano.engine.kernels.trees.tables import Chain, Coordinate, HangingBar, LoopIndex, Node
+from dano.physics.pairs import BodyState
+from dano.physics.real import ONE, quat, real, vec3, vec4, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turn_of_step
 from dano.physics.structures import product_of
-from dano.physics.trees.joint_laws import joint_momentum, joint_ramps, JointDrive, JointLaw, ramps_force
+from dano.physics.trees.joint_laws import joint_momentum, joint_ramps, JointDrive, ramps_force
 from dano.physics.trees.joints import (
     ball_after,
     Carrier,
     displacement_twist,
     hanging_move,
     hanging_pose,
-    Joint,
     motion_direction,
     motion_share,
     motion_twist,
     orientation_after,
 )
-from dano.physics.trees.loops import gap_by_twist, Loop, loop_gap, LoopEnd
+from dano.physics.trees.loops import gap_by_twist, loop_gap, LoopEnd
 from dano.physics.twists import angular_part, joined, linear_part, twist_at
 
-
-@wp.struct
-class JointSpeeds:
-    """Velocities of a joint's coordinates [rad/s or m/s]: old ones, those at the end, virtual ones."""
-
-    before: vec3
-    after: vec3
-    work: vec3
+# Efforts that bound nothing [N m or N]: zero times them is zero, as zero times infinity is not.
+_ENDLESS = wp.constant(real(1e30))
 
 
 @wp.func
-def root_chain(row: StateRow, y: vec6, virtual: vec6, origin: vec3, h: real) -> Chain:
+def com_of(given: Given, world: int, body: int) -> vec3:
+    """Centre of mass of a body [m, F]; zero of the world, −1."""
+    if body < 0:
+        return vec3()
+    return given.bodies[world, body].com
+
+
+@wp.func
+def chain_of(given: Given, world: int, node: int, body: int) -> Chain:
+    """How a node's body stands and moves; for no node how a body, or −1 for the world, stands still."""
+    if node >= 0:
+        return given.chains[world, node]
+    still = Chain()
+    still.orientation = quat(ZERO, ZERO, ZERO, ONE)
+    still.before.turn = still.orientation
+    still.after.turn = still.orientation
+    if body >= 0:
+        row = given.state[world, body]
+        still.position = row.position
+        still.orientation = from_wxyz(row.orientation)
+    return still
+
+
+@wp.func
+def coordinate_of(values: wp.array2d(dtype=real), world: int, node: Node, part: int) -> real:
+    """A number of a coordinate of a joint; zero where it has fewer."""
+    if part >= node.width:
+        return ZERO
+    return values[world, node.coordinate + part]
+
+
+@wp.func
+def coordinates_of(values: wp.array2d(dtype=real), world: int, node: Node) -> vec3:
+    """Numbers of a joint's coordinates."""
+    return vec3(
+        coordinate_of(values, world, node, 0),
+        coordinate_of(values, world, node, 1),
+        coordinate_of(values, world, node, 2),
+    )
+
+
+@wp.func
+def root_chain(given: Given, world: int, body: int, y: vec6, virtual: vec6, origin: vec3) -> Chain:
     """Of a body that moves freely; its velocities are taken at its centre of mass, wherever that is."""
     found = Chain()
+    row = given.state[world, body]
+    h = given.timestep[world, 0]
     q = from_wxyz(row.orientation)
     spin = matrix(q) * row.omega
     found.position = row.position
@@ -59,41 +97,41 @@ def root_chain(row: StateRow, y: vec6, virtual: vec6, origin: vec3, h: real) -> 
 
 @wp.func
 def hanging_chain(
-    kind: int,
-    joint: Joint,
-    parent: Chain,
-    parent_com: vec3,
-    com: vec3,
-    q: vec3,
-    speeds: JointSpeeds,
+    given: Given,
+    world: int,
+    node: Node,
+    y: vec3,
+    virtual: vec3,
     origin: vec3,
-    h: real,
 ) -> Chain:
     """Of a body on a joint.
 
     Args:
-        kind: Of the joint.
-        joint: The joint.
-        parent: What carries it.
-        parent_com: Centre of mass of that [m, F].
-        com: Of the body [m, F].
-        q: Coordinates [rad or m].
-        speeds: Their velocities.
+        given: What the step is given.
+        world: Which world.
+        node: The body.
+        y: Velocities of its joint at the end of the step [rad/s or m/s].
+        virtual: Virtual ones.
         origin: Of the tree [m, W]: sums of works do not depend on it.
-        h: Timestep [s].
     """
     found = Chain()
+    h = given.timestep[world, 0]
+    kind = node.kind
+    joint = given.joints[world, node.joint]
+    parent = chain_of(given, world, node.parent, node.carrier)
+    old = coordinates_of(given.v, world, node)
     carrier = Carrier()
     carrier.position = parent.position
     carrier.orientation = parent.orientation
-    carrier.com = parent_com
-    pose = hanging_pose(kind, joint, carrier, com, q)
+    carrier.com = com_of(given, world, node.carrier)
+    com = com_of(given, world, node.body)
+    pose = hanging_pose(kind, joint, carrier, com, coordinates_of(given.q, world, node))
     frame = pose.frame
     share = motion_share(kind, joint)
     arm = frame.pivot - parent.position
     lever = pose.position - frame.pivot
-    before = hanging_move(kind, joint, frame, parent.before, arm, lever, speeds.before, h)
-    after = hanging_move(kind, joint, frame, parent.after, arm, lever, speeds.after, h)
+    before = hanging_move(kind, joint, frame, parent.before, arm, lever, old, h)
+    after = hanging_move(kind, joint, frame, parent.after, arm, lever, y, h)
     found.position = pose.position
     found.orientation = pose.orientation
     found.before = before.displacement
@@ -103,8 +141,8 @@ def hanging_chain(
     for part in range(3):
         along = share * motion_direction(kind, frame, part)
         motion = motion_twist(kind, joint, part, along, frame.pivot - origin)
-        found.change += (speeds.after[part] - speeds.before[part]) * motion
-        found.work += speeds.work[part] * motion
+        found.change += (y[part] - old[part]) * motion
+        found.work += virtual[part] * motion
     return found
 
 
@@ -112,51 +150,49 @@ chain_product = product_of(Chain)
 
 
 @wp.func
-def root_work(row: StateRow, y: vec6, virtual: vec6, origin: vec3, h: real, bar: Chain) -> real:
+def root_work(given: Given, world: int, body: int, y: vec6, virtual: vec6, origin: vec3, bar: Chain) -> real:
     """⟨bar, chain of a body that moves freely⟩."""
-    return chain_product(bar, root_chain(row, y, virtual, origin, h))
+    return chain_product(bar, root_chain(given, world, body, y, virtual, origin))
 
 
 @wp.func
 def hanging_work(
-    kind: int,
-    joint: Joint,
-    parent: Chain,
-    parent_com: vec3,
-    com: vec3,
-    q: vec3,
-    speeds: JointSpeeds,
+    given: Given,
+    world: int,
+    node: Node,
+    y: vec3,
+    virtual: vec3,
     origin: vec3,
-    h: real,
     bar: Chain,
 ) -> real:
     """⟨bar, chain of a body on a joint⟩."""
-    return chain_product(bar, hanging_chain(kind, joint, parent, parent_com, com, q, speeds, origin, h))
+    return chain_product(bar, hanging_chain(given, world, node, y, virtual, origin))
 
 
 @wp.func
 def hanging_body_work(
-    body: Body,
-    row: StateRow,
-    push: Push,
-    gravity: vec3,
-    h: real,
-    chain: Chain,
+    given: Given,
+    world: int,
+    n: int,
+    i: int,
     origin: vec3,
     bar: HangingBar,
+    state_bar: BodyState,
 ) -> real:
-    """Work of what a body's momentum gains, and ⟨bar, what contact and the end of the step ask of it⟩.
+    """Work of what a body's momentum gains, and ⟨bars, what contact and the end of the step ask of it⟩.
 
     Args:
-        body: The body, on a joint.
-        row: Its state at the start, of which velocities count.
-        push: Control.
-        gravity: [m/s²].
-        h: Timestep [s].
-        chain: How it stands and moves.
+        given: What the step is given.
+        world: Which world.
+        n: Node of the body.
+        i: The body, on a joint.
         origin: Of its tree [m, W].
         bar: Derivatives by the rest.
+        state_bar: By how contact sees it at the start of the step.
     """
+    chain = given.chains[world, n]
+    h = given.timestep[world, 0]
+    row = given.state[world, i]
     lever = chain.position - origin
     virtual = twist_at(chain.work, lever)
     twist = displacement_twist(chain.after, h)
@@ -165,13 +201,11 @@ def hanging_body_work(
     stands.orientation = to_wxyz(chain.orientation)
     stands.velocity = row.velocity
     stands.omega = row.omega
-    at = Moment()
-    at.lead = ONE
-    total = momentum_work(body, stands, push, gravity, h, at, twist, virtual)
+    total = wp.dot(momentum_gained(given, world, i, stands, ZERO, ONE, twist), virtual)
     ahead = orientation_after(chain.before, chain.orientation)
-    total += wp.dot(bar.state.position, chain.position) + wp.dot(bar.state.orientation, chain.orientation)
-    total += wp.dot(bar.state.ahead, ahead) + wp.dot(bar.state.com, body.com)
-    total += wp.dot(bar.state.velocity, linear_part(came)) + wp.dot(bar.state.spin, angular_part(came))
+    total += wp.dot(state_bar.position, chain.position) + wp.dot(state_bar.orientation, chain.orientation)
+    total += wp.dot(state_bar.ahead, ahead) + wp.dot(state_bar.com, com_of(given, world, i))
+    total += wp.dot(state_bar.velocity, linear_part(came)) + wp.dot(state_bar.spin, angular_part(came))
     total += wp.dot(bar.twist, came + twist_at(chain.change, lever)) + wp.dot(bar.work, virtual)
     omega = wp.quat_rotate_inv(chain.orientation, angular_part(twist))
     return total + wp.dot(bar.velocity, linear_part(twist)) + wp.dot(bar.omega, omega)
@@ -179,36 +213,49 @@ def hanging_body_work(
 
 @wp.func
 def placing_work(
-    kind: int, joint: Joint, carrier: Carrier, com: vec3, q: vec3, position: vec3, orientation: vec4
+    given: Given, world: int, node: Node, carrier: Carrier, q: vec3, position: vec3, orientation: vec4
 ) -> real:
-    """⟨bars, pose of a body on a joint⟩."""
-    pose = hanging_pose(kind, joint, carrier, com, q)
+    """⟨bars, pose of a body on a joint⟩; its carrier is without its centre of mass."""
+    carries = carrier
+    carries.com = com_of(given, world, node.carrier)
+    com = com_of(given, world, node.body)
+    pose = hanging_pose(node.kind, given.joints[world, node.joint], carries, com, q)
     return wp.dot(position, pose.position) + wp.dot(orientation, to_wxyz(pose.orientation))
 
 
 @wp.func
-def ball_work(q: vec3, y: vec3, h: real, bar: vec3) -> real:
+def ball_work(given: Given, world: int, node: Node, y: vec3, bar: vec3) -> real:
     """⟨bar, coordinates of a ball joint at the end of a step⟩."""
-    return wp.dot(bar, ball_after(q, y, h))
+    return wp.dot(bar, ball_after(coordinates_of(given.q, world, node), y, given.timestep[world, 0]))
 
 
 @wp.func
 def coordinate_work(
-    law: JointLaw, drive: JointDrive, h: real, y: real, mass: real, has_kinks: bool, virtual: real
+    given: Given, world: int, c: int, coordinate: Coordinate, y: real, mass: real, virtual: real
 ) -> real:
     """Work of what acts on a coordinate along minus its virtual velocity.
 
     Args:
-        law: What acts.
-        drive: What drives it.
-        h: Timestep [s].
+        given: What the step is given.
+        world: Which world.
+        c: The coordinate.
+        coordinate: Its whole numbers.
         y: Velocity at the end [rad/s or m/s].
         mass: See `joint_ramps`.
-        has_kinks: Whether the law has some.
         virtual: The velocity.
     """
+    law = given.laws[world, c]
+    h = given.timestep[world, 0]
+    law.least_effort = wp.max(law.least_effort, -_ENDLESS)
+    law.most_effort = wp.min(law.most_effort, _ENDLESS)
+    drive = JointDrive()
+    drive.q = given.q[world, c]
+    drive.v = given.v[world, c]
+    drive.effort = given.efforts[world, c]
+    drive.command = given.commands[world, c]
+    drive.constant = coordinate.constant > 0
     momentum = joint_momentum(law, drive, h, y)
-    if has_kinks:
+    if coordinate.nonsmooth > 0:
         momentum += h * ramps_force(joint_ramps(law, drive, h, mass), y)
     return -virtual * momentum
 
@@ -233,33 +280,36 @@ def loop_end_after(chain: Chain) -> LoopEnd:
 
 @wp.func
 def loop_work(
-    loop: Loop,
-    first: Chain,
-    second: Chain,
+    given: Given,
+    world: int,
+    row: int,
+    index: LoopIndex,
     first_origin: vec3,
     second_origin: vec3,
     forces: vec6,
     virtual: vec6,
-    h: real,
 ) -> real:
     """Work of the forces in a loop, and of its gap along minus virtual ones.
 
     Args:
-        loop: The loop.
-        first: How its first body stands and moves.
-        second: Its second one.
-        first_origin: Of the tree of the first [m, W].
+        given: What the step is given.
+        world: Which world.
+        row: The loop.
+        index: Its whole numbers.
+        first_origin: Of the tree of its first body [m, W].
         second_origin: Of the second.
         forces: [N, N m].
         virtual: Virtual forces.
-        h: Timestep [s].
     """
+    loop = given.loops[world, row]
+    first = chain_of(given, world, index.first, index.first_body)
+    second = chain_of(given, world, index.second, index.second_body)
     one = loop_end(first)
     other = loop_end(second)
     moved = gap_by_twist(loop, one, one, twist_at(first.work, first.position - first_origin), False)
     moved += gap_by_twist(loop, one, other, twist_at(second.work, second.position - second_origin), True)
     gap = loop_gap(loop, loop_end_after(first), loop_end_after(second))
-    return h * wp.dot(forces, moved) - wp.dot(virtual, gap)
+    return given.timestep[world, 0] * wp.dot(forces, moved) - wp.dot(virtual, gap)
 
 
 for _function in (
