@@ -184,14 +184,59 @@ class FoundPair:
 
 @wp.struct
 class Given:
-    """What a step is given, by which derivatives are taken; or derivatives by it, or changes of it.
+    """What a step is given of bodies. Warp adds derivatives by it to `Bars` of the same name.
 
-    Attributes: those of `Scene`, `Trees`, `PatchTables` and `Launch` with the same names, of one step;
-    `weighted` are samples of contacts with a patch law, `coefficients` those of `Solids`. These and samples are
-    only there as derivatives, with no columns where nobody asks for them. And what follows from all these:
-        seen: `Room.bodies`.
-        chains: `TreeRoom.chains`.
-        sums: `PatchRoom.sums`.
+    Attributes: those of `Scene` and `Launch` with the same names, of one step;
+        seen: `Room.bodies`, with derivatives in `Room.body_bars`.
+    """
+
+    bodies: wp.array2d(dtype=Body)
+    gravity: wp.array2d(dtype=vec3)
+    timestep: wp.array2d(dtype=real)
+    state: wp.array2d(dtype=StateRow)
+    pushes: wp.array2d(dtype=Push)
+    seen: wp.array2d(dtype=BodyState)
+
+
+@wp.struct
+class GivenTrees:
+    """The same of bodies on joints.
+
+    Attributes: those of `Trees` and `Launch` with the same names;
+        chains: `TreeRoom.chains`, with derivatives in `TreeRoom.chain_bars`.
+    """
+
+    joints: wp.array2d(dtype=Joint)
+    laws: wp.array2d(dtype=JointLaw)
+    loops: wp.array2d(dtype=Loop)
+    q: wp.array2d(dtype=real)
+    v: wp.array2d(dtype=real)
+    efforts: wp.array2d(dtype=real)
+    commands: wp.array2d(dtype=real)
+    chains: wp.array2d(dtype=Chain)
+
+
+@wp.struct
+class GivenPatches:
+    """The same of contacts with a patch law.
+
+    Attributes: those of `PatchTables` with the same names, and leaves of solids;
+        sums: `PatchRoom.sums`, with derivatives in `PatchRoom.sum_bars`.
+    """
+
+    patch_materials: wp.array2d(dtype=PatchMaterial)
+    sides: wp.array2d(dtype=PatchSide)
+    leaves: wp.array2d(dtype=Leaf)
+    sums: wp.array2d(dtype=Sums)
+
+
+@wp.struct
+class Bars:
+    """Derivatives by what a step is given.
+
+    Attributes: those of `Given`, `GivenTrees`, `GivenPatches` and `Scene` with the same names; `weighted` are
+    samples of contacts with a patch law, `coefficients` those of `Solids`. These and samples have no columns
+    where nobody asks for them.
     """
 
     bodies: wp.array2d(dtype=Body)
@@ -215,9 +260,6 @@ class Given:
     samples: wp.array2d(dtype=Sample)
     weighted: wp.array2d(dtype=WeightedSample)
     coefficients: wp.array2d(dtype=real)
-    seen: wp.array2d(dtype=BodyState)
-    chains: wp.array2d(dtype=Chain)
-    sums: wp.array2d(dtype=Sums)
 
 
 @wp.struct
@@ -261,7 +303,9 @@ class Room:
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
         patches: Contacts with a patch law.
         trees: Room for bodies on joints.
-        given: What the step is given. Derivatives that Warp adds by address are those of `bars`.
+        given: What the step is given; only for derivatives.
+        given_trees: …
+        given_patches: …
         bars: Derivatives by it.
         body_bars: By `bodies`.
         after_bar: By the states at the end of a step.
@@ -308,7 +352,9 @@ class Room:
     patches: PatchRoom
     trees: TreeRoom
     given: Given
-    bars: Given
+    given_trees: GivenTrees
+    given_patches: GivenPatches
+    bars: Bars
     body_bars: wp.array2d(dtype=BodyState)
     after_bar: wp.array2d(dtype=StateRow)
     wrenches: wp.array2d(dtype=vec6)
@@ -322,12 +368,12 @@ class Room:
 class Ends:
     """What derivatives of a rollout are given, and what they give: derivatives, or changes in directions.
 
-    Attributes: those of `Launch` with the same names, for all steps; arrays of changes hold one direction after
-    the other.
-        given: What does not differ between steps, as `Given` has it, number by number, shape (worlds, numbers).
+    Attributes: those of `Launch` with the same names, for all steps; arrays of changes hold one direction
+    after the other.
+        given: What is given at the start, number by number in the order of a launch, shape (worlds, numbers).
         changes: Its changes.
-        values: What a step is given, see `Room.given`; the same numbers.
-        bars: Derivatives by it, see `Room.bars`; the same numbers.
+        values: What a step is given, which `Room.given` and others show; the same numbers.
+        bars: Derivatives by it, which `Room.bars` shows.
         samples: Changes of samples; no columns where they do not change.
         weighted: …
     """

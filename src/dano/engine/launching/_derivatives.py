@@ -38,6 +38,12 @@ _SCENE = {
     "parts": "scene.patches.fields.parts",
 }
 """What is the same for all steps: the other numbers there."""
+_READ = {
+    "given": ("bodies", "gravity", "timestep", "state", "pushes"),
+    "given_trees": ("joints", "laws", "loops", "q", "v", "efforts", "commands"),
+    "given_patches": ("patch_materials", "sides", "leaves"),
+}
+"""What kernels read of these, by parts of their room; derivatives by all are in `tables.Bars`."""
 _COEFFICIENTS = "scene.solids.coefficients"
 _MANY = {
     "scene.samples": "room.bars.samples",
@@ -175,9 +181,9 @@ def _with_numbers(forward: Plan) -> tuple[Shape, dict[str, Shape], dict[str, Vie
     numbers = _numbers(forward)
     row = Shape(sum(shape.rows * shape.width for _, _, shape in numbers.values()), 1)
     views = {
-        f"room.given.{k}": View("ends.values", at, shape, "ends.bars")
-        for k, (_, at, shape) in numbers.items()
-    }
+        f"room.{part}.{k}": View("ends.values", numbers[k][1], numbers[k][2], "ends.bars")
+        for part, names in _READ.items() for k in names if k in numbers
+    }  # fmt: skip
     views |= {f"room.bars.{k}": View("ends.bars", at, shape) for k, (_, at, shape) in numbers.items()}
     return row, {"ends.values": row, "ends.bars": row}, views
 

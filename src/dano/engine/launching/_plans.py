@@ -127,8 +127,8 @@ class Plan:
 
 _OF_ROOM = {
     "room.given.seen": ("room.bodies", "room.body_bars"),
-    "room.given.chains": ("room.trees.chains", "room.trees.chain_bars"),
-    "room.given.sums": ("room.patches.sums", "room.patches.sum_bars"),
+    "room.given_trees.chains": ("room.trees.chains", "room.trees.chain_bars"),
+    "room.given_patches.sums": ("room.patches.sums", "room.patches.sum_bars"),
 }
 
 _plans: dict[Any, Plan] = {}

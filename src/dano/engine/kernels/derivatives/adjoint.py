@@ -91,7 +91,6 @@ class Touching:
     rests: real  # See `share_left_out`
     material: Material  # With the share of the restitution that counts
     impact: Impact
-    twists: Virtual
 
 
 @wp.struct
@@ -110,6 +109,7 @@ impact_product, pose_product, body_product = product_of(Impact), product_of(Pair
 def sample_work(
     what: int,
     at: Touching,
+    twists: Virtual,
     sample: Sample,
     d: Distance,
     turning: int,
@@ -123,9 +123,9 @@ def sample_work(
         point = point_contact(at.pose, sample, d, turning, presses_back, at.stiffness_share, at.share * h)
         law = point_law(at.material, point, at.impact)
         apart = at.pose.com_difference
-        twist = relative_twist(at.twists.first, at.twists.second, apart)
-        virtual = relative_twist(at.twists.first_virtual, at.twists.second_virtual, apart)
-        late = relative_twist(at.twists.first_late, at.twists.second_late, apart)
+        twist = relative_twist(twists.first, twists.second, apart)
+        virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
+        late = relative_twist(twists.first_late, twists.second_late, apart)
         along = virtual.velocity - (at.impact.delays * at.share) * late.velocity
         turn = virtual.spin - (at.impact.delays * at.share) * late.spin
         motion = point_motion(point, twist.velocity, twist.spin)

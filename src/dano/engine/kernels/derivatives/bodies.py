@@ -85,9 +85,8 @@ def subtract_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: i
 def pull_delays(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Derivatives by velocities and by masses through impulses that take effect within the step."""
     for f in range(n_found):
-        found = room.found[world, f * _LANES + lane]
-        if found.impact.delays > ZERO:
-            subtract_slope(scene, room, world, lane, found)
+        if room.found[world, f * _LANES + lane].impact.delays > ZERO:
+            subtract_slope(scene, room, world, lane, room.found[world, f * _LANES + lane])
     wait()
     if lane == 0:
         for b in range(scene.n_blocks):

@@ -25,9 +25,11 @@ from dano.engine.kernels.derivatives.products import (
     add_to_leaf,
     add_to_material,
     add_to_touching,
+    add_to_twists,
     scaled_body,
     summed_body,
     total_touching,
+    total_twists,
 )
 from dano.engine.kernels.lanes import total_of
 from dano.engine.kernels.near import as_they_meet, facing, left_out, posed, solid_of_body
@@ -100,9 +102,12 @@ def pull_samples(
     what: int,
     found: FoundPair,
     at: Touching,
+    twists: Virtual,
     asked: Asked,
-) -> Touching:
+) -> tuple[Touching, Virtual]:
     """Derivatives by what the samples of a pair depend on, of all lanes; adds those by samples and solids.
+
+    Those by twists are only there with bodies on joints.
 
     Args:
         scene: The scene.
@@ -112,12 +117,14 @@ def pull_samples(
         what: What is asked of samples, see `PRESSES`.
         found: The pair.
         at: What they depend on.
+        twists: Of its bodies.
         asked: By what they give.
     """
     index = scene.pair_index[found.pair]
     turning = scene.body_index[index.first].turning
     bar = Touching()
-    twist = relative_twist(at.twists.first, at.twists.second, at.pose.com_difference)
+    twists_bar = Virtual()
+    twist = relative_twist(twists.first, twists.second, at.pose.com_difference)
     for k in range(found.first, found.end):
         where = room.where[world, k]
         counts = presses(room, world, k)
@@ -138,19 +145,23 @@ def pull_samples(
             if what == _RESTS:
                 counts = d.value < at.fall and facing_area(at.pose, sample, solid_normal(d.gradient)) > ZERO
             if counts:
-                _a, by, by_sample, by_distance, _b, _c, _d, _e = wp.grad(sample_work)(
-                    what, at, sample, d, turning, where.presses_back > 0, slip, asked
+                _a, by, by_twists, by_sample, by_distance, _b, _c, _d, _e = wp.grad(sample_work)(
+                    what, at, twists, sample, d, turning, where.presses_back > 0, slip, asked
                 )
                 by_x = pull_distance(scene, room, world, lane, solid, x, by_distance)
                 # x = points · sample + origin
                 by.pose.points = by.pose.points + wp.outer(by_x, sample.point)
                 by.pose.origin = by.pose.origin + by_x
                 add_to_touching(bar, by)
+                if wp.static(TREES):
+                    add_to_twists(twists_bar, by_twists)
                 if room.bars.samples.shape[1] > 0:
                     by_point = by_sample.point + wp.transpose(at.pose.points) * by_x
                     room.bars.samples[world, where.sample].point += by_point
                     room.bars.samples[world, where.sample].area += by_sample.area
-    return total_touching(bar)
+    if wp.static(TREES):
+        twists_bar = total_twists(twists_bar)
+    return total_touching(bar), twists_bar
 
 
 @wp.func
@@ -355,7 +366,7 @@ def pull_support(
     start.toward = facing(scene, world, a, b, index.first, index.second, ZERO, at.timestep)
     at.pose = posed(scene, world, a, b, index.first, index.second, ZERO, at.timestep, pair.follows)
     at.fall = fall_of(a, b, pair.impact_depth, at.timestep)
-    by = pull_samples(scene, room, world, lane, _RESTS, found, at, asked)
+    by, _g = pull_samples(scene, room, world, lane, _RESTS, found, at, Virtual(), asked)
     if lane == 0:
         of_first, of_second, of_depth, of_h = wp.grad(fall_of)(a, b, pair.impact_depth, at.timestep)
         started = pull_pose(scene, room, world, lane, start, a, b, at, by)
@@ -413,13 +424,12 @@ def pull_pair(
     at.rests = left_out(found, pair.factor)
     at.material = scene.materials[world, index.contact]
     at.impact = found.impact
-    at.twists = twists
     restores = ONE
     if at.material.instant > ZERO:
         restores = rebound
     at.material.restitution = restores * at.material.restitution
     asked = Asked()
-    by = pull_samples(scene, room, world, lane, _PRESSES, found, at, asked)
+    by, by_twists = pull_samples(scene, room, world, lane, _PRESSES, found, at, twists, asked)
     by.material.restitution = restores * by.material.restitution
     by.rests = by.impact.rests
     bar = PairBar()
@@ -443,7 +453,8 @@ def pull_pair(
             scene.body_index[index.first].turning, hits, alone, found.impact.delays > ZERO, by.impact,
         )  # fmt: skip
         asked.patch = by_patch
-        add_to_touching(by, pull_samples(scene, room, world, lane, _MEETS, found, at, asked))
+        of_patch, _i = pull_samples(scene, room, world, lane, _MEETS, found, at, twists, asked)
+        add_to_touching(by, of_patch)
         by.share += by_share
         by.timestep += by_h
         bar.first = summed_body(bar.first, by_first)
@@ -466,4 +477,4 @@ def pull_pair(
     if lane == 0:
         bar.first = falling_bar(bar.first, found.falls)
         bar.second = falling_bar(bar.second, found.falls)
-    return bar, by.twists
+    return bar, by_twists

@@ -41,10 +41,10 @@ def take_step(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], 
         room.given.pushes[world, i] = push_of(scene, launch, world, t, i)
     for c in range(scene.trees.coordinates.shape[0]):
         drive = room.trees.joints[world, c].drive
-        room.given.q[world, c] = drive.q
-        room.given.v[world, c] = drive.v
-        room.given.efforts[world, c] = drive.effort
-        room.given.commands[world, c] = drive.command
+        room.given_trees.q[world, c] = drive.q
+        room.given_trees.v[world, c] = drive.v
+        room.given_trees.efforts[world, c] = drive.effort
+        room.given_trees.commands[world, c] = drive.command
 
 
 @wp.func
@@ -133,9 +133,9 @@ def pull_end(
 
 
 @wp.func
-def twists_of_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> Virtual:
+def twists_of_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, entry: int) -> Virtual:
     """How contact sees the bodies of a pair move at the end of the step, and with virtual velocities."""
-    index = scene.pair_index[found.pair]
+    index = scene.pair_index[room.found[world, entry].pair]
     first = scene.body_index[index.first].row
     second = scene.body_index[index.second].row
     twists = Virtual()
@@ -144,7 +144,7 @@ def twists_of_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: 
     twists.first_virtual = twist_of(scene, room, world, first, room.step, ZERO)
     twists.second_virtual = twist_of(scene, room, world, second, room.step, ZERO)
     if wp.static(not TREES):
-        if found.impact.delays > ZERO:
+        if room.found[world, entry].impact.delays > ZERO:
             twists.first_late = row_of(room.late, world, first)
             twists.second_late = row_of(room.late, world, second)
     return twists
@@ -159,14 +159,14 @@ def is_moved_pair(twists: Virtual) -> bool:
 
 @wp.func
 def balance_bars(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, found: FoundPair
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, entry: int
 ) -> tuple[real, real]:
     """A pair's part of derivatives by when the angular momentum of the body that moves is balanced."""
     met = real(0.0)
     lead = real(0.0)
     if wp.static(not TREES):
-        if found.impact.delays > ZERO:
-            body = moving_of(scene, found)
+        if room.found[world, entry].impact.delays > ZERO:
+            body = moving_of(scene, room.found[world, entry])
             count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
             met = room.body_bars[world, body].met / count
             lead = room.body_bars[world, body].lead / count
@@ -193,10 +193,11 @@ def pull_equations(
                 pull_momentum(scene, room, world, i)
     wait()
     for f in range(n_found):
-        found = room.found[world, f * _LANES + lane]
-        twists = twists_of_pair(scene, room, world, found)
-        met, lead = balance_bars(scene, room, world, n_found, found)
+        entry = f * _LANES + lane
+        twists = twists_of_pair(scene, room, world, entry)
+        met, lead = balance_bars(scene, room, world, n_found, entry)
         if is_moved_pair(twists) or met != ZERO or lead != ZERO:
+            found = room.found[world, entry]
             rebound = launch.reports[world, t].rebound
             bar, by_twists = pull_pair(scene, room, world, lane, found, rebound, twists, met, lead)
             if lane == 0:
@@ -204,7 +205,7 @@ def pull_equations(
     if wp.static(PATCHES):
         for p in range(room.patches.count[world, 0]):
             touching = room.found[world, (n_found + p) * _LANES + lane]
-            twists_there = twists_of_pair(scene, room, world, touching)
+            twists_there = twists_of_pair(scene, room, world, (n_found + p) * _LANES + lane)
             if is_moved_pair(twists_there):
                 by = pull_patch(scene, room, world, lane, touching, twists_there)
                 if lane == 0:

@@ -9,7 +9,7 @@ import warp as wp
 from dano.engine.kernels.derivatives.adjoint import need_adjoints, Virtual
 from dano.engine.kernels.patch_tables import PatchContact, PatchTables
 from dano.engine.kernels.patches import frame_of
-from dano.engine.kernels.tables import Given
+from dano.engine.kernels.tables import Given, GivenPatches
 from dano.physics.features import KINDS
 from dano.physics.overlap import (
     added,
@@ -43,6 +43,7 @@ from dano.physics.twists import relative_twist
 @wp.func
 def patch_of_sides(
     given: Given,
+    patches: GivenPatches,
     tables: PatchTables,
     world: int,
     contact: PatchContact,
@@ -63,14 +64,18 @@ def patch_of_sides(
                 if wp.static(SPHERE in KINDS and HALF_SPACE in KINDS):
                     plane = tables.fields.kinds[index.first_part].first_leaf
                     patch = cap_patch(
-                        given.leaves[world, index.ball], given.leaves[world, plane], sampled, queried, mass
+                        patches.leaves[world, index.ball],
+                        patches.leaves[world, plane],
+                        sampled,
+                        queried,
+                        mass,
                     )
                     patch.normal = sign * patch.normal
                     is_cap = True
             else:
-                own = given.sums[world, s]
+                own = patches.sums[world, s]
                 if own.share > ZERO:
-                    mass = mass * given.sides[world, s].density_scale
+                    mass = mass * patches.sides[world, s].density_scale
                     whole = added(whole, sums_in_world(own, sampled, queried, mass, sign))
     if not is_cap:
         patch = patch_of(whole, ZERO)
@@ -80,6 +85,7 @@ def patch_of_sides(
 @wp.func
 def patch_work(
     given: Given,
+    patches: GivenPatches,
     tables: PatchTables,
     world: int,
     c: int,
@@ -87,14 +93,14 @@ def patch_work(
 ) -> real:
     """Work of the impulse of a patch along the virtual velocities of its bodies."""
     contact = tables.contacts[c]
-    patch = patch_of_sides(given, tables, world, contact)
+    patch = patch_of_sides(given, patches, tables, world, contact)
     first = given.seen[world, contact.first].position
     apart = first - given.seen[world, contact.second].position
     arm = patch.centroid - first
     twist = relative_twist(twists.first, twists.second, apart)
     virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
     slip = twist.velocity + wp.cross(twist.spin, arm)
-    found = patch_law(given.patch_materials[world, c], patch, contact.adhesive > 0, slip, twist.spin)
+    found = patch_law(patches.patch_materials[world, c], patch, contact.adhesive > 0, slip, twist.spin)
     moved = virtual.velocity + wp.cross(virtual.spin, arm)
     return given.timestep[world, 0] * (wp.dot(found.force, moved) + wp.dot(found.moment, virtual.spin))
 
@@ -131,6 +137,7 @@ def grid_work(solids: Solids, world: int, solid: Solid, x: vec3, bar: Density) -
 @wp.func
 def view_work(
     given: Given,
+    patches: GivenPatches,
     world: int,
     sampled: int,
     queried: int,
@@ -140,7 +147,7 @@ def view_work(
 ) -> real:
     """⟨bar, a field as the samples of another body see it⟩."""
     solid = field.solid
-    solid.leaf = given.leaves[world, leaf]
+    solid.leaf = patches.leaves[world, leaf]
     own = field
     own.solid = solid
     return view_product(

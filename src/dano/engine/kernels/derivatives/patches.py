@@ -108,8 +108,15 @@ def pull_side(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, s
     view = view_of(field, sampled, frame_of(room.bodies[world, index.queried]))
     by_view = pull_weighted(scene, room, world, lane, index, field, view, room.patches.sum_bars[world, s])
     if lane == 0:
-        _a, _b, _c, _d, _e, _f, _g = wp.grad(view_work)(
-            room.given, world, index.sampled, index.queried, field, field.solid.first, by_view
+        _a, _b, _c, _d, _e, _f, _g, _h = wp.grad(view_work)(
+            room.given,
+            room.given_patches,
+            world,
+            index.sampled,
+            index.queried,
+            field,
+            field.solid.first,
+            by_view,
         )
 
 
@@ -124,7 +131,9 @@ def pull_patch(
     if lane == 0:
         for s in range(contact.first_side, contact.first_side + contact.sides):
             room.patches.sum_bars[world, s] = Sums()
-        _a, _b, _c, _d, by_twists = wp.grad(patch_work)(room.given, scene.patches, world, c, twists)
+        _a, _b, _c, _d, _e, by_twists = wp.grad(patch_work)(
+            room.given, room.given_patches, scene.patches, world, c, twists
+        )
         bar = by_twists
     wait()
     s = int(contact.first_side)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import Touching
+from dano.engine.kernels.derivatives.adjoint import Touching, Virtual
 from dano.engine.kernels.lanes import total_of
 from dano.engine.kernels.tables import StateRow
 from dano.engine.kernels.trees.tables import Chain
@@ -17,6 +17,7 @@ from dano.physics.structures import adding_of, addition_of, product_of, scaled_o
 sample_product, weighted_product = product_of(Sample), product_of(WeightedSample)
 body_product, row_product = product_of(BodyState), product_of(StateRow)
 add_to_touching, total_touching = adding_of(Touching), total_of(Touching)
+add_to_twists, total_twists = adding_of(Virtual), total_of(Virtual)
 summed_body, scaled_body = sum_of(BodyState), scaled_of(BodyState)
 summed_chain = sum_of(Chain)
 summed_view, total_view = sum_of(View), total_of(View)

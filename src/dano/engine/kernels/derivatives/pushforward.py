@@ -93,6 +93,19 @@ def take_changes(
 
 
 @wp.func
+def row_change(room: wp.ref[Room], world: int, at: int) -> StateRow:
+    """Change of a body's state at the start of a step, from where its numbers begin."""
+    row = StateRow()
+    for c in range(3):
+        row.position[c] = room.moving[world, at + c]
+        row.velocity[c] = room.moving[world, at + 7 + c]
+        row.omega[c] = room.moving[world, at + 10 + c]
+    for c in range(4):
+        row.orientation[c] = room.moving[world, at + 3 + c]
+    return row
+
+
+@wp.func
 def add_along(room: wp.ref[Room], world: int, lane: int, d: int, change: real):
     """Add the parts of all lanes of what the changes in a direction make of a number."""
     whole = total(change)
@@ -246,10 +259,18 @@ def push_end(
     if lane == 0:
         for d in range(launch.n_directions):
             for i in range(n):
-                ends.states[world, (d * launch.n_steps + t) * n + i] = StateRow()
+                # What does not move ends as it begins.
+                begins = StateRow()
+                if scene.body_index[i].row < 0:
+                    begins = row_change(room, world, d * ends.bars.shape[1] + 13 * i)
+                ends.states[world, (d * launch.n_steps + t) * n + i] = begins
     number = int(0)
     while number < 13 * n + 2 * k:
         i = number // 13
+        if i < n:
+            if scene.body_index[i].row < 0:
+                number += 13
+                continue
         c = number - 13 * n
         unit = unit_row(number % 13)
         clear_bars(scene, room, ends, world, lane)

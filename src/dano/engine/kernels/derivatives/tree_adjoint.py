@@ -8,7 +8,7 @@ the roots.
 import warp as wp
 
 from dano.engine.kernels.derivatives.adjoint import momentum_gained, need_adjoints
-from dano.engine.kernels.tables import Given, StateRow
+from dano.engine.kernels.tables import Given, GivenTrees, StateRow
 from dano.engine.kernels.trees.tables import Chain, Coordinate, HangingBar, LoopIndex, Node
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, quat, real, vec3, vec4, vec6, ZERO
@@ -42,10 +42,10 @@ def com_of(given: Given, world: int, body: int) -> vec3:
 
 
 @wp.func
-def chain_of(given: Given, world: int, node: int, body: int) -> Chain:
+def chain_of(given: Given, trees: GivenTrees, world: int, node: int, body: int) -> Chain:
     """How a node's body stands and moves; for no node how a body, or −1 for the world, stands still."""
     if node >= 0:
-        return given.chains[world, node]
+        return trees.chains[world, node]
     still = Chain()
     still.orientation = quat(ZERO, ZERO, ZERO, ONE)
     still.before.turn = still.orientation
@@ -98,6 +98,7 @@ def root_chain(given: Given, world: int, body: int, y: vec6, virtual: vec6, orig
 @wp.func
 def hanging_chain(
     given: Given,
+    trees: GivenTrees,
     world: int,
     node: Node,
     y: vec3,
@@ -108,6 +109,7 @@ def hanging_chain(
 
     Args:
         given: What the step is given.
+        trees: …
         world: Which world.
         node: The body.
         y: Velocities of its joint at the end of the step [rad/s or m/s].
@@ -117,15 +119,15 @@ def hanging_chain(
     found = Chain()
     h = given.timestep[world, 0]
     kind = node.kind
-    joint = given.joints[world, node.joint]
-    parent = chain_of(given, world, node.parent, node.carrier)
-    old = coordinates_of(given.v, world, node)
+    joint = trees.joints[world, node.joint]
+    parent = chain_of(given, trees, world, node.parent, node.carrier)
+    old = coordinates_of(trees.v, world, node)
     carrier = Carrier()
     carrier.position = parent.position
     carrier.orientation = parent.orientation
     carrier.com = com_of(given, world, node.carrier)
     com = com_of(given, world, node.body)
-    pose = hanging_pose(kind, joint, carrier, com, coordinates_of(given.q, world, node))
+    pose = hanging_pose(kind, joint, carrier, com, coordinates_of(trees.q, world, node))
     frame = pose.frame
     share = motion_share(kind, joint)
     arm = frame.pivot - parent.position
@@ -158,6 +160,7 @@ def root_work(given: Given, world: int, body: int, y: vec6, virtual: vec6, origi
 @wp.func
 def hanging_work(
     given: Given,
+    trees: GivenTrees,
     world: int,
     node: Node,
     y: vec3,
@@ -166,12 +169,13 @@ def hanging_work(
     bar: Chain,
 ) -> real:
     """⟨bar, chain of a body on a joint⟩."""
-    return chain_product(bar, hanging_chain(given, world, node, y, virtual, origin))
+    return chain_product(bar, hanging_chain(given, trees, world, node, y, virtual, origin))
 
 
 @wp.func
 def hanging_body_work(
     given: Given,
+    trees: GivenTrees,
     world: int,
     n: int,
     i: int,
@@ -183,6 +187,7 @@ def hanging_body_work(
 
     Args:
         given: What the step is given.
+        trees: …
         world: Which world.
         n: Node of the body.
         i: The body, on a joint.
@@ -190,7 +195,7 @@ def hanging_body_work(
         bar: Derivatives by the rest.
         state_bar: By how contact sees it at the start of the step.
     """
-    chain = given.chains[world, n]
+    chain = trees.chains[world, n]
     h = given.timestep[world, 0]
     row = given.state[world, i]
     lever = chain.position - origin
@@ -213,30 +218,45 @@ def hanging_body_work(
 
 @wp.func
 def placing_work(
-    given: Given, world: int, node: Node, carrier: Carrier, q: vec3, position: vec3, orientation: vec4
+    given: Given,
+    trees: GivenTrees,
+    world: int,
+    node: Node,
+    carrier: Carrier,
+    q: vec3,
+    position: vec3,
+    orientation: vec4,
 ) -> real:
     """⟨bars, pose of a body on a joint⟩; its carrier is without its centre of mass."""
     carries = carrier
     carries.com = com_of(given, world, node.carrier)
     com = com_of(given, world, node.body)
-    pose = hanging_pose(node.kind, given.joints[world, node.joint], carries, com, q)
+    pose = hanging_pose(node.kind, trees.joints[world, node.joint], carries, com, q)
     return wp.dot(position, pose.position) + wp.dot(orientation, to_wxyz(pose.orientation))
 
 
 @wp.func
-def ball_work(given: Given, world: int, node: Node, y: vec3, bar: vec3) -> real:
+def ball_work(given: Given, trees: GivenTrees, world: int, node: Node, y: vec3, bar: vec3) -> real:
     """⟨bar, coordinates of a ball joint at the end of a step⟩."""
-    return wp.dot(bar, ball_after(coordinates_of(given.q, world, node), y, given.timestep[world, 0]))
+    return wp.dot(bar, ball_after(coordinates_of(trees.q, world, node), y, given.timestep[world, 0]))
 
 
 @wp.func
 def coordinate_work(
-    given: Given, world: int, c: int, coordinate: Coordinate, y: real, mass: real, virtual: real
+    given: Given,
+    trees: GivenTrees,
+    world: int,
+    c: int,
+    coordinate: Coordinate,
+    y: real,
+    mass: real,
+    virtual: real,
 ) -> real:
     """Work of what acts on a coordinate along minus its virtual velocity.
 
     Args:
         given: What the step is given.
+        trees: …
         world: Which world.
         c: The coordinate.
         coordinate: Its whole numbers.
@@ -244,15 +264,15 @@ def coordinate_work(
         mass: See `joint_ramps`.
         virtual: The velocity.
     """
-    law = given.laws[world, c]
+    law = trees.laws[world, c]
     h = given.timestep[world, 0]
     law.least_effort = wp.max(law.least_effort, -_ENDLESS)
     law.most_effort = wp.min(law.most_effort, _ENDLESS)
     drive = JointDrive()
-    drive.q = given.q[world, c]
-    drive.v = given.v[world, c]
-    drive.effort = given.efforts[world, c]
-    drive.command = given.commands[world, c]
+    drive.q = trees.q[world, c]
+    drive.v = trees.v[world, c]
+    drive.effort = trees.efforts[world, c]
+    drive.command = trees.commands[world, c]
     drive.constant = coordinate.constant > 0
     momentum = joint_momentum(law, drive, h, y)
     if coordinate.nonsmooth > 0:
@@ -281,6 +301,7 @@ def loop_end_after(chain: Chain) -> LoopEnd:
 @wp.func
 def loop_work(
     given: Given,
+    trees: GivenTrees,
     world: int,
     row: int,
     index: LoopIndex,
@@ -293,6 +314,7 @@ def loop_work(
 
     Args:
         given: What the step is given.
+        trees: …
         world: Which world.
         row: The loop.
         index: Its whole numbers.
@@ -301,9 +323,9 @@ def loop_work(
         forces: [N, N m].
         virtual: Virtual forces.
     """
-    loop = given.loops[world, row]
-    first = chain_of(given, world, index.first, index.first_body)
-    second = chain_of(given, world, index.second, index.second_body)
+    loop = trees.loops[world, row]
+    first = chain_of(given, trees, world, index.first, index.first_body)
+    second = chain_of(given, trees, world, index.second, index.second_body)
     one = loop_end(first)
     other = loop_end(second)
     moved = gap_by_twist(loop, one, one, twist_at(first.work, first.position - first_origin), False)

@@ -50,7 +50,9 @@ def follow_chains(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
             else:
                 y = velocities_of(room.velocity, world, node)
                 virtual = velocities_of(room.step, world, node)
-                room.trees.chains[world, n] = hanging_chain(room.given, world, node, y, virtual, origin)
+                room.trees.chains[world, n] = hanging_chain(
+                    room.given, room.given_trees, world, node, y, virtual, origin
+                )
 
 
 @wp.func
@@ -81,14 +83,14 @@ def pull_hanging(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n: int):
     """Add derivatives through a body on a joint and its joint, to what carries it."""
     node = scene.trees.nodes[n]
     origin = room.bodies[world, node.origin].position
-    _a, _b, _c, _d, _e, _f, _g = wp.grad(hanging_body_work)(
-        room.given, world, n, node.body, origin, room.trees.hanging_bars[world, n],
+    _z, _a, _b, _c, _d, _e, _f, _g = wp.grad(hanging_body_work)(
+        room.given, room.given_trees, world, n, node.body, origin, room.trees.hanging_bars[world, n],
         room.body_bars[world, node.body],
     )  # fmt: skip
     y = velocities_of(room.velocity, world, node)
     virtual = velocities_of(room.step, world, node)
-    _i, _j, _k, by_y, _m, _n, _o = wp.grad(hanging_work)(
-        room.given, world, node, y, virtual, origin, room.trees.chain_bars[world, n]
+    _z, _i, _j, _k, by_y, _m, _n, _o = wp.grad(hanging_work)(
+        room.given, room.given_trees, world, node, y, virtual, origin, room.trees.chain_bars[world, n]
     )
     add_unknowns(room.residual, world, node, by_y)
     ask(room, world, node.parent)
@@ -146,8 +148,8 @@ def pull_places(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch]
             first = t * scene.trees.coordinates.shape[0] + node.coordinate
             for part in range(node.width):
                 q[part] = launch.qs[world, first + part]
-            _a, _b, _c, by_carrier, by_q, _d, _e = wp.grad(placing_work)(
-                room.given, world, node, carrier_after(scene, launch, world, t, node.carrier), q,
+            _z, _a, _b, _c, by_carrier, by_q, _d, _e = wp.grad(placing_work)(
+                room.given, room.given_trees, world, node, carrier_after(scene, launch, world, t, node.carrier), q,
                 asked.position, asked.orientation,
             )  # fmt: skip
             if node.carrier >= 0:
@@ -170,8 +172,8 @@ def pull_coordinates(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
             bar = coordinates_of(room.trees.q_after, world, node)
             for part in range(3):
                 room.trees.q_after[world, node.coordinate + part] = ZERO
-            _a, _b, _c, by_y, _d = wp.grad(ball_work)(
-                room.given, world, node, velocities_of(room.velocity, world, node), bar
+            _z, _a, _b, _c, by_y, _d = wp.grad(ball_work)(
+                room.given, room.given_trees, world, node, velocities_of(room.velocity, world, node), bar
             )
             add_unknowns(room.residual, world, node, by_y)
     for c in range(scene.trees.coordinates.shape[0]):
@@ -209,8 +211,8 @@ def pull_laws(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
             continue
         y = unknown_of(room.velocity, world, coordinate.place)
         mass = h * room.trees.joints[world, c].rho
-        _a, _b, _c, _d, _e, _f, _g = wp.grad(coordinate_work)(
-            room.given, world, c, coordinate, y, mass, virtual
+        _z, _a, _b, _c, _d, _e, _f, _g = wp.grad(coordinate_work)(
+            room.given, room.given_trees, world, c, coordinate, y, mass, virtual
         )
 
 
@@ -219,8 +221,8 @@ def pull_loops(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Add derivatives through the loops."""
     for row in range(scene.trees.loop_index.shape[0]):
         index = scene.trees.loop_index[row]
-        _a, _b, _c, _d, _e, _f, _g, _h = wp.grad(loop_work)(
-            room.given, world, row, index,
+        _z, _a, _b, _c, _d, _e, _f, _g, _h = wp.grad(loop_work)(
+            room.given, room.given_trees, world, row, index,
             origin_of(scene, room, world, index.first), origin_of(scene, room, world, index.second),
             forces_of(scene, room.velocity, world, row), forces_of(scene, room.step, world, row),
         )  # fmt: skip
