@@ -82,6 +82,24 @@ def addition_of(structure: Any) -> Any:
     return written(structure, "add", [head, *lines])
 
 
+def vjp_of(function: Any) -> Any:
+    """⟨bar, f(…)⟩ of a function whose result is a vector or a structure: its gradient is f's derivative.
+
+    The arguments are those of f, then the bar.
+    """
+    kinds = dict(function.func.__annotations__)
+    result = kinds.pop("return")
+    takes = [*kinds, "bar"]
+    names = {"f": function, **{f"K{i}": kind for i, kind in enumerate([*kinds.values(), result])}}
+    product = "wp.dot(bar, {})"
+    if _is_structure(result):
+        names["product"], product = product_of(result), "product(bar, {})"
+    head = ", ".join(f"{name}: K{i}" for i, name in enumerate(takes))
+    call = f"f({', '.join(kinds)})"
+    lines = [f"def vjp({head}) -> real:", f"    return {product.format(call)}"]
+    return written(function, "vjp", lines, names)
+
+
 def fields_of(structure: Any) -> list[tuple[str, Any]]:
     """Names and types of a structure's fields that are real numbers, or made of them."""
     kinds = ((name, var.type) for name, var in structure.vars.items())
@@ -108,7 +126,7 @@ def written(
     """A Warp function of a text, in which S is the structure.
 
     Args:
-        structure: The structure.
+        structure: The structure, or a function that it is made from.
         name: Of the function.
         lines: Of its text.
         names: What else the text refers to.

@@ -311,9 +311,9 @@ class Room:
         after_bar: By the states at the end of a step.
         wrenches: Impulse of each pair that is near, at the first body's centre of mass [N s, N m s, W].
         missing: Changes of the equations of a step, shape (worlds, directions · m).
-        along: Changes of a number, by directions.
-        moving: Changes of `given`, one direction after the other.
-        splines: Changes of an equation by changes of coefficients, shape (worlds, directions · lanes).
+        moving: Changes of what the step is given, one direction after the other.
+        along: What they make of a number, by directions.
+        parts: … by changes of samples and coefficients, the part of each lane, (worlds, directions · lanes).
     """
 
     bodies: wp.array2d(dtype=BodyState)
@@ -361,19 +361,23 @@ class Room:
     missing: wp.array2d(dtype=vec6)
     along: wp.array2d(dtype=real)
     moving: wp.array2d(dtype=real)
-    splines: wp.array2d(dtype=real)
+    parts: wp.array2d(dtype=real)
 
 
 @wp.struct
 class Ends:
     """What derivatives of a rollout are given, and what they give: derivatives, or changes in directions.
 
-    Attributes: those of `Launch` with the same names, for all steps; arrays of changes hold one direction
-    after the other.
-        given: What is given at the start, number by number in the order of a launch, shape (worlds, numbers).
+    All are numbers in the order of a launch, of shape (worlds, …); changes are one direction after the other.
+
+    Attributes:
+        given: What is given at the start of the rollout.
         changes: Its changes.
-        values: What a step is given, which `Room.given` and others show; the same numbers.
-        bars: Derivatives by it, which `Room.bars` shows.
+        values: What a step is given, as `Room.given` and others show it.
+        bars: Derivatives by it, as `Room.bars` shows them.
+        after: By the state at the end of a step.
+        ends: By those at the ends of all steps, or their changes.
+        controls: By the controls of all steps, or their changes.
         samples: Changes of samples; no columns where they do not change.
         weighted: …
     """
@@ -382,11 +386,8 @@ class Ends:
     changes: wp.array2d(dtype=real)
     values: wp.array2d(dtype=real)
     bars: wp.array2d(dtype=real)
-    states: wp.array2d(dtype=StateRow)
-    qs: wp.array2d(dtype=real)
-    vs: wp.array2d(dtype=real)
-    pushes: wp.array2d(dtype=Push)
-    efforts: wp.array2d(dtype=real)
-    commands: wp.array2d(dtype=real)
+    after: wp.array2d(dtype=real)
+    ends: wp.array2d(dtype=real)
+    controls: wp.array2d(dtype=real)
     samples: wp.array2d(dtype=Sample)
     weighted: wp.array2d(dtype=WeightedSample)

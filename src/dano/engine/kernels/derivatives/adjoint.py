@@ -53,7 +53,7 @@ from dano.physics.rotations import from_wxyz, interpolated, matrix, to_wxyz, tur
 from dano.physics.samples import point_contact, position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.leaves import Distance, Solids
-from dano.physics.structures import product_of
+from dano.physics.structures import product_of, vjp_of
 from dano.physics.twists import angular_part, joined, linear_part, relative_twist, wrench_at
 
 PRESSES, MEETS, RESTS = 0, 1, 2
@@ -76,6 +76,18 @@ class Virtual:
     second_virtual: vec6
     first_late: vec6
     second_late: vec6
+
+
+@wp.struct
+class MetPair:
+    """The bodies of a pair, and when and how they meet."""
+
+    first: BodyState  # The sampled body
+    second: BodyState  # The other
+    scale: vec3  # Semi-axes of the first [m]
+    share: real  # τ
+    timestep: real  # h [s]
+    toward: vec3  # Direction that samples which turn face [F]
 
 
 @wp.struct
@@ -102,7 +114,8 @@ class Asked:
 
 
 patch_product, rest_product = product_of(Patch), product_of(Rest)
-impact_product, pose_product, body_product = product_of(Impact), product_of(PairPose), product_of(BodyState)
+impact_product, body_product = product_of(Impact), product_of(BodyState)
+distance_work = vjp_of(leaf_distance)
 
 
 @wp.func
@@ -149,43 +162,18 @@ def sample_work(
 
 
 @wp.func
-def distance_work(solids: Solids, world: int, solid: Solid, x: vec3, bar: Distance) -> real:
-    """⟨bar, distance and gradient of a leaf at x⟩."""
-    d = leaf_distance(solids, world, solid.kind, solid.leaf, x)
-    return bar.value * d.value + wp.dot(bar.gradient, d.gradient)
+def pose_of(at: MetPair, turning: int, follows: real) -> PairPose:
+    """Pose of a pair when geometry is taken."""
+    return pair_pose(at.first, at.second, at.share, at.timestep, at.toward, turning, at.scale, follows)
+
+
+pose_work = vjp_of(pose_of)
 
 
 @wp.func
-def critical_work(
-    first: BodyState,
-    second: BodyState,
-    share: real,
-    h: real,
-    toward: vec3,
-    turning: int,
-    scale: vec3,
-    sample: vec3,
-    gradient: vec3,
-) -> real:
-    """Distance of a sample from a solid after a share of the step, as it changes with where the sample is."""
-    pose = pair_pose(first, second, share, h, toward, turning, scale, ZERO)
-    return wp.dot(gradient, position_in_solid(pose, sample))
-
-
-@wp.func
-def pair_work(
-    first: BodyState,
-    second: BodyState,
-    share: real,
-    h: real,
-    toward: vec3,
-    turning: int,
-    scale: vec3,
-    follows: real,
-    bar: PairPose,
-) -> real:
-    """⟨bar, pose of a pair⟩."""
-    return pose_product(bar, pair_pose(first, second, share, h, toward, turning, scale, follows))
+def critical_work(at: MetPair, turning: int, sample: vec3, gradient: vec3) -> real:
+    """Distance of a sample from a solid when geometry is taken, as it changes with where the sample is."""
+    return wp.dot(gradient, position_in_solid(pose_of(at, turning, ZERO), sample))
 
 
 @wp.func
@@ -193,27 +181,30 @@ def facing_work(
     solids: Solids,
     world: int,
     solid: Solid,
-    first: BodyState,
-    second: BodyState,
-    share: real,
-    h: real,
+    at: MetPair,
     turning: int,
-    scale: vec3,
     point: vec3,
-    toward_bar: vec3,
-    touched_bar: vec3,
+    by_toward: vec3,
+    bar: vec3,
 ) -> real:
     """⟨bars, direction that samples face, and where one step of the search for it leads from a point⟩."""
-    inverse = wp.transpose(rotation_after(second, share))
-    turn = inverse * rotation_after(first, share)
-    com = inverse * (position_after(first, share, h) - position_after(second, share, h)) + second.com
-    origin = com - turn * first.com
+    origin, turn = origin_in_solid(at)
     if turning == 1:
-        return wp.dot(toward_bar, seen_from(solids, world, solid, turn, origin).gradient)
-    found = closer(solids, world, solid, turn, origin, scale, point)
-    least = wp.min(scale[0], wp.min(scale[1], scale[2]))
-    touched = shrunk(scale, least, point) + wp.max(found.value, ZERO) * found.gradient
-    return wp.dot(toward_bar, found.gradient) + wp.dot(touched_bar, touched)
+        return wp.dot(by_toward, seen_from(solids, world, solid, turn, origin).gradient)
+    found = closer(solids, world, solid, turn, origin, at.scale, point)
+    least = wp.min(at.scale[0], wp.min(at.scale[1], at.scale[2]))
+    touched = shrunk(at.scale, least, point) + wp.max(found.value, ZERO) * found.gradient
+    return wp.dot(by_toward, found.gradient) + wp.dot(bar, touched)
+
+
+@wp.func
+def origin_in_solid(at: MetPair) -> tuple[vec3, mat33]:
+    """Origin of the first body's frame [m], and its turn, as the second body's solid sees them."""
+    inverse = wp.transpose(rotation_after(at.second, at.share))
+    turn = inverse * rotation_after(at.first, at.share)
+    h = at.timestep
+    apart = position_after(at.first, at.share, h) - position_after(at.second, at.share, h)
+    return inverse * apart + at.second.com - turn * at.first.com, turn
 
 
 @wp.func
@@ -324,42 +315,29 @@ def late_work(given: Given, world: int, i: int, lost: vec6, late: vec6) -> real:
 
 @wp.func
 def impact_work(
-    first: BodyState,
-    second: BodyState,
+    at: MetPair,
     patch: Patch,
     material: Material,
     factor: real,
-    share: real,
-    h: real,
     turning: int,
     hits: bool,
     alone: bool,
     waits: bool,
     bar: Impact,
 ) -> real:
-    """⟨bar, impact of a pair⟩, without what no pair differs in.
+    """⟨bar, impact of a pair⟩, without what it is given as it is.
 
-    Args:
-        first: First body as they meet.
-        second: Second body.
-        patch: Samples that have sunk in.
-        material: Of the contact.
-        factor: F.
-        share: τ.
-        h: Timestep [s].
-        turning: How samples turn with the first body.
-        hits: Whether they are that deep.
-        alone: Whether one of the bodies is fixed and the other moves freely.
-        waits: Whether impulses take effect when they meet.
-        bar: By the impact.
+    `factor` is F; `hits` says whether bodies are deep enough, `alone` whether one is fixed and the other
+    moves freely, `waits` whether impulses take effect when they meet.
     """
+    h = at.timestep
     impact = no_impact(ZERO, ZERO, ZERO, h)
     impact.share = share_of_impact(patch, material.bounce)
     if hits:
-        impact.stiffness = stiffness_of_impact(first, second, patch, material.bounce, factor, h)
-        impact = delayed(impact, wp.where(waits, impact.share, ZERO), share, h)
+        impact.stiffness = stiffness_of_impact(at.first, at.second, patch, material.bounce, factor, h)
+        impact = delayed(impact, wp.where(waits, impact.share, ZERO), at.share, h)
         if alone:
-            impact.turns = turning_after(first, second, patch, material.friction, share, turning)
+            impact.turns = turning_after(at.first, at.second, patch, material.friction, at.share, turning)
     return impact_product(bar, impact)
 
 
@@ -378,30 +356,31 @@ def waiting_work(found: FoundPair, twists: Virtual, met: real, lead: real) -> re
 
 @wp.func
 def support_work(
-    first: BodyState,
-    second: BodyState,
+    at: MetPair,
     rest: Rest,
     depth: real,
     material: Material,
     factor: real,
-    h: real,
     turning: int,
     bar: vec6,
-    first_bar: BodyState,
-    second_bar: BodyState,
+    met_bar: MetPair,
     depth_bar: real,
     rests_bar: real,
 ) -> real:
     """⟨bars, what a pair rests on while it nears an impact, its bodies as they meet, and their depth⟩."""
-    impulse = support_of(first, second, rest, material.friction, h, turning)
-    back = wrench_at(impulse, first.position - second.position)
+    h = at.timestep
+    impulse = support_of(at.first, at.second, rest, material.friction, h, turning)
+    back = wrench_at(impulse, at.first.position - at.second.position)
     total = wp.dot(bar, impulse) + depth_bar * depth_beside(rest, depth)
     total += rests_bar * share_left_out(rest, factor)
-    return (
-        total
-        + body_product(first_bar, supported(first, impulse, h))
-        + body_product(second_bar, supported(second, -back, h))
-    )
+    total += body_product(met_bar.first, supported(at.first, impulse, h))
+    return total + body_product(met_bar.second, supported(at.second, -back, h))
+
+
+@wp.func
+def fall_work(at: MetPair, depth: real, bar: real) -> real:
+    """⟨bar, how far bodies fall in a step⟩."""
+    return bar * fall_of(at.first, at.second, depth, at.timestep)
 
 
 def need_adjoints(function: Any, seen: set[int] | None = None) -> None:
@@ -433,7 +412,7 @@ def _names_in(code: CodeType) -> set[str]:
 
 
 for _function in (
-    sample_work, distance_work, critical_work, pair_work, facing_work, momentum_work, state_work,
-    advance_work, late_work, impact_work, waiting_work, support_work, fall_of,
+    sample_work, distance_work, pose_work, critical_work, facing_work, momentum_work, state_work,
+    advance_work, late_work, impact_work, waiting_work, support_work, fall_work,
 ):  # fmt: skip
     need_adjoints(_function)

@@ -9,9 +9,12 @@ from dano.engine.kernels.derivatives.adjoint import (
     critical_work,
     distance_work,
     facing_work,
+    fall_work,
     impact_work,
     MEETS,
-    pair_work,
+    MetPair,
+    origin_in_solid,
+    pose_work,
     PRESSES,
     RESTS,
     sample_work,
@@ -20,57 +23,33 @@ from dano.engine.kernels.derivatives.adjoint import (
     Virtual,
     waiting_work,
 )
-from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
-from dano.engine.kernels.derivatives.products import (
-    add_to_leaf,
-    add_to_material,
-    add_to_touching,
-    add_to_twists,
-    scaled_body,
-    summed_body,
-    total_touching,
-    total_twists,
-)
-from dano.engine.kernels.lanes import total_of
+from dano.engine.kernels.lanes import total, total_of
 from dano.engine.kernels.near import as_they_meet, facing, left_out, posed, solid_of_body
-from dano.engine.kernels.tables import FoundPair, PairIndex, Room, Scene
-from dano.physics.features import TREES, UNIONS
+from dano.engine.kernels.tables import FoundPair, Room, Scene
+from dano.physics.features import KINDS, LANES, TREES, UNIONS
 from dano.physics.friction import Slip
 from dano.physics.impacts import fall_of
-from dano.physics.pairs import (
-    BALL,
-    BodyState,
-    falling,
-    falling_bar,
-    first_touch,
-    position_after,
-    rotation_after,
-)
-from dano.physics.point_law import point_motion, slip_at, slip_of
+from dano.physics.pairs import BALL, BodyState, falling, falling_bar, first_touch, PairPose
+from dano.physics.point_law import Material, point_motion, slip_at, slip_of
 from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
 from dano.physics.samples import facing_area, position_in_solid, solid_normal
 from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
+from dano.physics.solids.grids import distance_change
+from dano.physics.solids.kinds import GRID
 from dano.physics.solids.leaves import Distance, Leaf
+from dano.physics.structures import adding_of, addition_of, product_of, scaled_of, sum_of
 from dano.physics.twists import relative_twist
 
-_BALL = wp.constant(BALL)
+_BALL, _GRID, _LANES = wp.constant(BALL), wp.constant(GRID), wp.constant(LANES)
 _PRESSES, _MEETS, _RESTS = wp.constant(PRESSES), wp.constant(MEETS), wp.constant(RESTS)
 
 
-@wp.struct
-class PairBar:
-    """Derivatives by what a pair of bodies is at the start of a step."""
-
-    first: BodyState  # By the state of the sampled body
-    second: BodyState  # By that of the other
-    scale: vec3  # By the semi-axes of the sampled body
-    timestep: real  # By h
-    sink: real  # By the depth up to which predicted geometry is taken
-    depth: real  # By δ
-    beside: real  # By the depth at which a part meets, of a pair that rests on another
-
-
-total_bar = total_of(PairBar)
+add_to_met, total_met = adding_of(MetPair), total_of(MetPair)
+scaled_met, summed_body = scaled_of(MetPair), sum_of(BodyState)
+add_to_touching, total_touching = adding_of(Touching), total_of(Touching)
+add_to_twists, total_twists = adding_of(Virtual), total_of(Virtual)
+add_to_leaf, add_to_material = addition_of(Leaf), addition_of(Material)
+distance_product = product_of(Distance)
 
 
 @wp.func
@@ -83,13 +62,33 @@ def leaf_at(scene: wp.ref[Scene], world: int, body: int, x: vec3) -> Solid:
 
 
 @wp.func
+def add_part(room: wp.ref[Room], world: int, lane: int, direction: int, change: real):
+    """Add to a lane's part of what changes in a direction make of a number."""
+    room.parts[world, direction * _LANES + lane] = room.parts[world, direction * _LANES + lane] + change
+
+
+@wp.func
+def n_moving(scene: wp.ref[Scene], room: wp.ref[Room]) -> int:
+    """In how many directions coefficients of sampled solids change."""
+    if scene.solids.changes.shape[1] == 0:
+        return 0
+    return room.parts.shape[1] // _LANES
+
+
+@wp.func
 def pull_distance(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, solid: Solid, x: vec3, bar: Distance
 ) -> vec3:
     """Derivative by a point from one by the distance of a leaf there; adds those by the leaf."""
-    _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, bar)
-    add_to_leaf(room.bars.leaves, world, solid.first, by_solid.leaf)
-    add_distance_changes(scene, room, world, lane, solid, x, bar)
+    _a, _b, _c, by_leaf, by_x, _d = wp.grad(distance_work)(
+        scene.solids, world, solid.kind, solid.leaf, x, bar
+    )
+    add_to_leaf(room.bars.leaves, world, solid.first, by_leaf)
+    if wp.static(GRID in KINDS):
+        if solid.kind.kind == _GRID:
+            for k in range(n_moving(scene, room)):
+                moved = distance_change(scene.solids, world, solid.kind, solid.leaf, x, k)
+                add_part(room, world, lane, k, distance_product(bar, moved))
     return by_x
 
 
@@ -109,16 +108,7 @@ def pull_samples(
 
     Those by twists are only there with bodies on joints.
 
-    Args:
-        scene: The scene.
-        room: Room.
-        world: Which world.
-        lane: Which lane.
-        what: What is asked of samples, see `PRESSES`.
-        found: The pair.
-        at: What they depend on.
-        twists: Of its bodies.
-        asked: By what they give.
+    `what` is asked of them, see `PRESSES`.
     """
     index = scene.pair_index[found.pair]
     turning = scene.body_index[index.first].turning
@@ -166,29 +156,20 @@ def pull_samples(
 
 @wp.func
 def facing_point_bar(
-    scene: wp.ref[Scene],
-    world: int,
-    solid: Solid,
-    a: BodyState,
-    b: BodyState,
-    share: real,
-    scale: vec3,
-    point: vec3,
-    toward_bar: vec3,
+    scene: wp.ref[Scene], world: int, solid: Solid, at: MetPair, point: vec3, toward_bar: vec3
 ) -> vec3:
     """Derivative by where the search for the first touch ended, x = G(x): (1 − ∂G/∂x)⁻ᵀ x̄."""
-    h = scene.timestep[world, 0]
     zero = vec3()
-    _a, _b, _c, _d, _e, _f, _g, _h, _i, point_bar, _j, _k = wp.grad(facing_work)(
-        scene.solids, world, solid, a, b, share, h, _BALL, scale, point, toward_bar, zero
+    _a, _b, _c, _d, _e, point_bar, _f, _g = wp.grad(facing_work)(
+        scene.solids, world, solid, at, _BALL, point, toward_bar, zero
     )
     rows = mat33()
     k = int(0)
     while k < 3:
         unit = vec3()
         unit[k] = ONE
-        _l, _m, _n, _o, _p, _q, _r, _s, _t, by_point, _u, _v = wp.grad(facing_work)(
-            scene.solids, world, solid, a, b, share, h, _BALL, scale, point, zero, unit
+        _h, _i, _j, _k, _l, by_point, _m, _n = wp.grad(facing_work)(
+            scene.solids, world, solid, at, _BALL, point, zero, unit
         )
         rows[k] = unit - by_point
         k += 1
@@ -197,43 +178,26 @@ def facing_point_bar(
 
 @wp.func
 def pull_facing(
-    scene: wp.ref[Scene],
-    world: int,
-    index: PairIndex,
-    a: BodyState,
-    b: BodyState,
-    share: real,
-    toward_bar: vec3,
-) -> tuple[PairBar, real, int, Leaf]:
-    """Derivatives through the direction that samples face: by the pair, by τ, and by a leaf and which it is.
+    scene: wp.ref[Scene], world: int, second: int, turning: int, at: MetPair, toward_bar: vec3
+) -> tuple[MetPair, int, Leaf]:
+    """Derivatives through the direction that samples face: by the pair, and by a leaf and which it is.
 
     A ball or an ellipsoid faces where the search for its first touch ended: a fixed point of the search,
     differentiated by the implicit function theorem.
     """
-    bar = PairBar()
-    turning = scene.body_index[index.first].turning
-    scale = scene.bodies[world, index.first].scale
-    h = scene.timestep[world, 0]
-    inverse = wp.transpose(rotation_after(b, share))
-    turn = inverse * rotation_after(a, share)
-    com = inverse * (position_after(a, share, h) - position_after(b, share, h)) + b.com
-    origin = com - turn * a.com
+    origin, turn = origin_in_solid(at)
     point = vec3()
-    solid = leaf_at(scene, world, index.second, origin)
-    touched_bar = vec3()
+    solid = leaf_at(scene, world, second, origin)
+    point_bar = vec3()
     if turning == _BALL:
-        whole = solid_of_body(scene, world, index.second)
-        point = first_touch(scene.solids, world, whole, turn, origin, scale)
-        solid = leaf_at(scene, world, index.second, origin + turn * point)
-        touched_bar = facing_point_bar(scene, world, solid, a, b, share, scale, point, toward_bar)
-    _l, _m, by_solid, by_first, by_second, by_share, by_h, _n, by_scale, _o, _p, _q = wp.grad(facing_work)(
-        scene.solids, world, solid, a, b, share, h, turning, scale, point, toward_bar, touched_bar
+        whole = solid_of_body(scene, world, second)
+        point = first_touch(scene.solids, world, whole, turn, origin, at.scale)
+        solid = leaf_at(scene, world, second, origin + turn * point)
+        point_bar = facing_point_bar(scene, world, solid, at, point, toward_bar)
+    _a, _b, by_solid, bar, _c, _d, _e, _f = wp.grad(facing_work)(
+        scene.solids, world, solid, at, turning, point, toward_bar, point_bar
     )
-    bar.first = by_first
-    bar.second = by_second
-    bar.scale = by_scale
-    bar.timestep = by_h
-    return bar, by_share, solid.first, by_solid.leaf
+    return bar, solid.first, by_solid.leaf
 
 
 @wp.func
@@ -243,81 +207,63 @@ def pull_pose(
     world: int,
     lane: int,
     found: FoundPair,
-    a: BodyState,
-    b: BodyState,
-    at: Touching,
+    at: MetPair,
+    pose: PairPose,
     by: Touching,
-) -> PairBar:
-    """Derivatives by the states of a pair's bodies from those by its pose, τ and h.
+) -> tuple[MetPair, real]:
+    """Derivatives by a pair's bodies, and by the depth at which they meet, from those by its pose, τ and h.
 
     One lane alone comes here: Warp itself adds those by coefficients.
     """
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
-    scale = scene.bodies[world, index.first].scale
-    h = scene.timestep[world, 0]
-    bar = PairBar()
-    toward = found.toward
-    by_first, by_second, by_share, by_h, toward_bar, _a, by_scale, _b, _c = wp.grad(pair_work)(
-        a, b, found.share, h, toward, turning, scale, pair.follows, by.pose
-    )
-    bar.first = by_first
-    bar.second = by_second
-    bar.scale = by_scale
-    bar.timestep = by.timestep + by_h
-    share_bar = by.share + by_share
+    bar, _a, _b, _c = wp.grad(pose_work)(at, turning, scene.pairs[world, found.pair].follows, by.pose)
+    bar.share += by.share
+    bar.timestep += by.timestep
+    depth_bar = real(0.0)
     if found.critical >= 0:
         # τ is the root of distance + depth = 0 at the critical sample.
         critical = scene.samples[world, found.critical].point
-        x = position_in_solid(at.pose, critical)
+        x = position_in_solid(pose, critical)
         solid = leaf_at(scene, world, index.second, x)
         d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-        of_first, of_second, of_share, of_h, of_toward, _d, of_scale, of_sample, _e = wp.grad(critical_work)(
-            a, b, found.share, h, toward, turning, scale, critical, d.gradient
-        )
-        slope = of_share
+        of, _d, of_sample, _e = wp.grad(critical_work)(at, turning, critical, d.gradient)
+        slope = of.share
+        share_bar = bar.share
         if turning > 0:
-            _f, along, _g, _h = pull_facing(scene, world, index, a, b, found.share, of_toward)
-            slope += along
+            along, _f, _g = pull_facing(scene, world, index.second, turning, at, of.toward)
+            slope += along.share
             # What the points feel of the direction that they face depends on τ, too.
-            _i, turns, _j, _k = pull_facing(scene, world, index, a, b, found.share, toward_bar)
-            share_bar += turns
+            turns, _h, _i = pull_facing(scene, world, index.second, turning, at, bar.toward)
+            share_bar += turns.share
         if slope < ZERO:
-            share = -share_bar / slope
-            bar.first = summed_body(bar.first, scaled_body(share, of_first))
-            bar.second = summed_body(bar.second, scaled_body(share, of_second))
-            bar.scale += share * of_scale
-            bar.timestep += share * of_h
-            if found.hits > 0 and wp.length_sq(found.support) > ZERO:
-                bar.beside += share
-            elif found.hits > 0 or pair.impact_depth > pair.sink:
-                bar.depth += share
-            else:
-                bar.sink += share
-            toward_bar += share * of_toward
+            depth_bar = -share_bar / slope
+            add_to_met(bar, scaled_met(depth_bar, of))
             of_distance = Distance()
-            of_distance.value = share
-            _l = pull_distance(scene, room, world, lane, solid, x, of_distance)
+            of_distance.value = depth_bar
+            _j = pull_distance(scene, room, world, lane, solid, x, of_distance)
             if room.bars.samples.shape[1] > 0:
-                room.bars.samples[world, found.critical].point += share * of_sample
+                room.bars.samples[world, found.critical].point += depth_bar * of_sample
     if turning > 0:
-        faces, _m, leaf, by_leaf = pull_facing(scene, world, index, a, b, found.share, toward_bar)
+        faces, leaf, by_leaf = pull_facing(scene, world, index.second, turning, at, bar.toward)
         add_to_leaf(room.bars.leaves, world, leaf, by_leaf)
-        bar = summed_bar(bar, faces)
-    return bar
+        add_to_met(bar, faces)
+    return bar, depth_bar
 
 
 @wp.func
-def summed_bar(one: PairBar, other: PairBar) -> PairBar:
-    """Sum of derivatives."""
-    bar = one
-    bar.first = summed_body(one.first, other.first)
-    bar.second = summed_body(one.second, other.second)
-    bar.scale += other.scale
-    bar.timestep += other.timestep
-    bar.depth += other.depth
-    return bar
+def met_pair(
+    scene: wp.ref[Scene], world: int, found: FoundPair, a: BodyState, b: BodyState, share: real, toward: vec3
+) -> MetPair:
+    """Bodies of a pair after a share of the step."""
+    at = MetPair()
+    at.first = a
+    at.second = b
+    at.scale = scene.bodies[world, scene.pair_index[found.pair].first].scale
+    at.share = share
+    at.timestep = scene.timestep[world, 0]
+    at.toward = toward
+    return at
 
 
 @after_adjoints
@@ -330,59 +276,47 @@ def pull_support(
     found: FoundPair,
     support_bar: vec6,
     rests_bar: real,
-    bar: PairBar,
-) -> PairBar:
-    """Derivatives by bodies that fall, from those by bodies that something supports while they do.
+    depth_bar: real,
+    bar: MetPair,
+) -> MetPair:
+    """Derivatives by bodies that fall, from those by bodies as they meet that something supports until then.
 
-    Args:
-        scene: The scene.
-        room: Room.
-        world: Which world.
-        lane: Which lane.
-        found: The pair.
-        support_bar: By what supports it.
-        rests_bar: By `left_out`.
-        bar: By bodies as they meet.
+    The others are those by what supports them, by `left_out` and by the depth at which they meet.
     """
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
-    at = Touching()
-    at.material = scene.materials[world, index.contact]
-    at.timestep = scene.timestep[world, 0]
     turning = scene.body_index[index.first].turning
+    h = scene.timestep[world, 0]
     a = falling(room.bodies[world, index.first], found.falls)
     b = falling(room.bodies[world, index.second], found.falls)
+    toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
+    at = met_pair(scene, world, found, a, b, ZERO, toward)
+    samples = Touching()
+    samples.material = scene.materials[world, index.contact]
+    samples.timestep = h
+    samples.pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
+    samples.fall = fall_of(a, b, pair.impact_depth, h)
     asked = Asked()
-    by_first, by_second, by_rest, by_depth, by_material, by_factor, by_h, _a, _b, _c, _d, _e, _f = wp.grad(
-        support_work
-    )(
-        a, b, found.rest, pair.impact_depth, at.material, pair.factor, at.timestep, turning, support_bar,
-        bar.first, bar.second, bar.beside, rests_bar,
+    whole, by_rest, by_depth, by_material, by_factor, _a, _b, _c, _d, _e = wp.grad(support_work)(
+        at, found.rest, pair.impact_depth, samples.material, pair.factor, turning, support_bar,
+        total_met(bar), total(depth_bar), rests_bar,
     )  # fmt: skip
     asked.rest = by_rest
-    start = found
-    start.share = ZERO
-    start.critical = -1
-    start.toward = facing(scene, world, a, b, index.first, index.second, ZERO, at.timestep)
-    at.pose = posed(scene, world, a, b, index.first, index.second, ZERO, at.timestep, pair.follows)
-    at.fall = fall_of(a, b, pair.impact_depth, at.timestep)
-    by, _g = pull_samples(scene, room, world, lane, _RESTS, found, at, Virtual(), asked)
+    by, _f = pull_samples(scene, room, world, lane, _RESTS, found, samples, Virtual(), asked)
     if lane == 0:
-        of_first, of_second, of_depth, of_h = wp.grad(fall_of)(a, b, pair.impact_depth, at.timestep)
-        started = pull_pose(scene, room, world, lane, start, a, b, at, by)
-        started.first = summed_body(started.first, scaled_body(by.fall, of_first))
-        started.second = summed_body(started.second, scaled_body(by.fall, of_second))
-        started.scale += bar.scale
-        started.timestep += bar.timestep + by_h + by.fall * of_h
-        started.depth += bar.depth + by_depth + by.fall * of_depth
-        started.sink = bar.sink
-        started.first = summed_body(started.first, by_first)
-        started.second = summed_body(started.second, by_second)
-        bar = started
+        start = found
+        start.critical = -1
+        begins, _g = pull_pose(scene, room, world, lane, start, at, samples.pose, by)
+        falls, of_depth, _h = wp.grad(fall_work)(at, pair.impact_depth, by.fall)
+        add_to_met(whole, begins)
+        add_to_met(whole, falls)
+        whole.scale += bar.scale
+        whole.timestep += bar.timestep
         room.bars.pairs[world, found.pair].factor += by_factor
+        room.bars.pairs[world, found.pair].impact_depth += by_depth + of_depth
         add_to_material(room.bars.materials, world, index.contact, by_material)
         add_to_material(room.bars.materials, world, index.contact, by.material)
-    return bar
+    return whole
 
 
 @after_adjoints
@@ -397,42 +331,37 @@ def pull_pair(
     twists: Virtual,
     met_bar: real,
     lead_bar: real,
-) -> tuple[PairBar, Virtual]:
-    """Derivatives by the states of a pair's bodies, for the first lane, and by twists; adds those by all else.
+) -> tuple[MetPair, Virtual]:
+    """Derivatives by a pair's bodies, for the first lane, and by twists; adds those by all else.
 
-    Args:
-        scene: The scene.
-        room: Room.
-        world: Which world.
-        lane: Which lane.
-        found: The pair.
-        rebound: Share of the restitution that counts.
-        twists: Of its bodies.
-        met_bar: By `BodyState.met` of its bodies, its part.
-        lead_bar: By `BodyState.lead`.
+    `rebound` is the share of the restitution that counts; the bars are the pair's part of those by when the
+    angular momentum of its bodies is balanced.
     """
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
+    turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
     a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
-    at = Touching()
-    at.pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
-    at.share = found.share
-    at.timestep = h
-    at.stiffness_share = pair.share
-    at.depth = pair.impact_depth
-    at.rests = left_out(found, pair.factor)
-    at.material = scene.materials[world, index.contact]
-    at.impact = found.impact
+    at = met_pair(scene, world, found, a, b, found.share, found.toward)
+    samples = Touching()
+    samples.pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
+    samples.share = found.share
+    samples.timestep = h
+    samples.stiffness_share = pair.share
+    samples.depth = pair.impact_depth
+    samples.rests = left_out(found, pair.factor)
+    samples.material = scene.materials[world, index.contact]
+    samples.impact = found.impact
     restores = ONE
-    if at.material.instant > ZERO:
+    if samples.material.instant > ZERO:
         restores = rebound
-    at.material.restitution = restores * at.material.restitution
+    samples.material.restitution = restores * samples.material.restitution
     asked = Asked()
-    by, by_twists = pull_samples(scene, room, world, lane, _PRESSES, found, at, twists, asked)
+    by, by_twists = pull_samples(scene, room, world, lane, _PRESSES, found, samples, twists, asked)
     by.material.restitution = restores * by.material.restitution
     by.rests = by.impact.rests
-    bar = PairBar()
+    factor_bar = by.impact.factor
+    bar = MetPair()
     support_bar = vec6()
     if found.impact.share > ZERO:
         hits = found.impact.stiffness > ZERO
@@ -446,34 +375,41 @@ def pull_pair(
                 support_bar = by_found.support
                 bar.first.position += by_found.com_difference
                 bar.second.position -= by_found.com_difference
-        by_first, by_second, by_patch, by_material, by_factor, by_share, by_h, _d, _e, _f, _g, _h = wp.grad(
-            impact_work
-        )(
-            a, b, found.patch, scene.materials[world, index.contact], pair.factor, found.share, h,
-            scene.body_index[index.first].turning, hits, alone, found.impact.delays > ZERO, by.impact,
+        by_impact, by_patch, by_material, by_factor, _d, _e, _f, _g, _h = wp.grad(impact_work)(
+            at, found.patch, scene.materials[world, index.contact], pair.factor, turning, hits, alone,
+            found.impact.delays > ZERO, by.impact,
         )  # fmt: skip
         asked.patch = by_patch
-        of_patch, _i = pull_samples(scene, room, world, lane, _MEETS, found, at, twists, asked)
+        of_patch, _i = pull_samples(scene, room, world, lane, _MEETS, found, samples, twists, asked)
         add_to_touching(by, of_patch)
-        by.share += by_share
-        by.timestep += by_h
-        bar.first = summed_body(bar.first, by_first)
-        bar.second = summed_body(bar.second, by_second)
+        # What follows from when they meet is left to where that is.
+        by.share += by_impact.share
+        by_impact.share = ZERO
+        add_to_met(bar, by_impact)
+        factor_bar += by_factor
         if lane == 0:
-            room.bars.pairs[world, found.pair].factor += by_factor
             add_to_material(room.bars.materials, world, index.contact, by_material)
+    depth_bar = real(0.0)
     if lane == 0:
-        bar = summed_bar(pull_pose(scene, room, world, lane, found, a, b, at, by), bar)
+        of_pose, depth_bar = pull_pose(scene, room, world, lane, found, at, samples.pose, by)
+        add_to_met(bar, of_pose)
         add_to_material(room.bars.materials, world, index.contact, by.material)
         room.bars.pairs[world, found.pair].share += by.stiffness_share
         room.bars.pairs[world, found.pair].impact_depth += by.depth + by.impact.depth
-        room.bars.pairs[world, found.pair].factor += by.impact.factor
+        room.bars.pairs[world, found.pair].factor += factor_bar
         room.bars.pairs[world, found.pair].deepest += by.impact.deepest
+        rests = found.hits > 0 and wp.length_sq(found.support) > ZERO
+        if not rests and (found.hits > 0 or pair.impact_depth > pair.sink):
+            room.bars.pairs[world, found.pair].impact_depth += depth_bar
+        elif not rests:
+            room.bars.pairs[world, found.pair].sink += depth_bar
+        if not rests:
+            depth_bar = ZERO
+    else:
+        bar = MetPair()
     if wp.static(not TREES):
         if wp.length_sq(found.support) > ZERO:
-            if lane > 0:
-                bar = PairBar()
-            bar = pull_support(scene, room, world, lane, found, support_bar, by.rests, total_bar(bar))
+            bar = pull_support(scene, room, world, lane, found, support_bar, by.rests, depth_bar, bar)
     if lane == 0:
         bar.first = falling_bar(bar.first, found.falls)
         bar.second = falling_bar(bar.second, found.falls)

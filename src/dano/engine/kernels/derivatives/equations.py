@@ -3,11 +3,17 @@
 import warp as wp
 
 from dano.engine.kernels.assembly import row_of, twist_of
-from dano.engine.kernels.derivatives.adjoint import after_adjoints, Virtual
-from dano.engine.kernels.derivatives.bodies import pull_advance, pull_body, pull_delays, pull_momentum
-from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
+from dano.engine.kernels.derivatives.adjoint import (
+    advance_work,
+    after_adjoints,
+    late_work,
+    MetPair,
+    momentum_work,
+    state_work,
+    Virtual,
+)
+from dano.engine.kernels.derivatives.contact import pull_pair, summed_body
 from dano.engine.kernels.derivatives.patches import pull_patch
-from dano.engine.kernels.derivatives.products import summed_body
 from dano.engine.kernels.derivatives.trees import (
     add_hanging,
     ask_of_end,
@@ -19,7 +25,7 @@ from dano.engine.kernels.derivatives.trees import (
     pull_places,
     transpose_entries,
 )
-from dano.engine.kernels.impacts import meetings_of, moving_of
+from dano.engine.kernels.impacts import freed, meetings_of, moving_of, pair_slope
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_transposed_blocks, EVERYWHERE, solve_blocks
 from dano.engine.kernels.rollout import Launch, push_of, row_before
@@ -29,6 +35,87 @@ from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, real, vec6, ZERO
+from dano.physics.structures import product_of
+from dano.physics.twists import shift
+
+_LANES = wp.constant(LANES)
+body_product, row_product = product_of(BodyState), product_of(StateRow)
+
+
+@wp.func
+def pull_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int):
+    """Add derivatives by a body's row and properties from those by its state, which are used up."""
+    bar = room.body_bars[world, i]
+    if not (body_product(bar, bar) == ZERO):
+        _a, _b, _c, _d, _e = wp.grad(state_work)(room.given, world, i, scene.body_index[i].row >= 0, bar)
+        room.body_bars[world, i] = BodyState()
+
+
+@wp.func
+def pull_momentum(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int):
+    """Add derivatives through the momentum that a body comes with, gravity and control."""
+    b = block_of(scene, scene.body_index[i].row)
+    _a, _b, _c, _d, _e = wp.grad(momentum_work)(
+        room.given, world, i, room.velocity[world, b], room.step[world, b]
+    )
+
+
+@wp.func
+def pull_advance(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, after: StateRow):
+    """Derivatives by the velocities and the row of a body from those by its row at the end of a step."""
+    m = scene.body_index[i].row
+    if m < 0:
+        room.bars.state[world, i] = after
+        return
+    b = block_of(scene, m)
+    room.residual[world, b] = vec6()
+    room.late[world, b] = vec6()
+    if not (row_product(after, after) == ZERO):
+        _a, _b, _c, by_velocity, by_moved, _e = wp.grad(advance_work)(
+            room.given, world, i, room.velocity[world, b], room.moved[world, b], after
+        )
+        room.residual[world, b] = by_velocity + by_moved
+        if wp.static(not TREES):
+            room.late[world, b] = freed(room, world, i, m, by_moved)
+
+
+@wp.func
+def subtract_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, found: FoundPair):
+    """Take what the delayed impulse of a pair makes of positions by its velocities off their derivatives."""
+    slope = pair_slope(scene, room, world, found)
+    if lane == 0:
+        index = scene.pair_index[found.pair]
+        a = scene.body_index[index.first].row
+        b = scene.body_index[index.second].row
+        t = shift(found.com_difference)
+        late = vec6()
+        if a >= 0:
+            late = room.late[world, a]
+        if b >= 0:
+            late = late - t * room.late[world, b]
+        by_twist = (found.impact.delays * found.share) * (wp.transpose(slope) * late)
+        if a >= 0:
+            room.residual[world, a] -= by_twist
+        if b >= 0:
+            room.residual[world, b] += wp.transpose(t) * by_twist
+
+
+@after_adjoints
+@wp.func
+def pull_delays(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
+    """Derivatives by velocities and by masses through impulses that take effect within the step."""
+    for f in range(n_found):
+        if room.found[world, f * _LANES + lane].impact.delays > ZERO:
+            subtract_slope(scene, room, world, lane, room.found[world, f * _LANES + lane])
+    wait()
+    if lane == 0:
+        for b in range(scene.n_blocks):
+            lost = room.velocity[world, b] - room.moved[world, b]
+            if wp.length_sq(lost) > ZERO:
+                _a, _b, _c, _d, _e = wp.grad(late_work)(
+                    room.given, world, scene.moving[b], lost, room.late[world, b]
+                )
+
 
 _LANES = wp.constant(LANES)
 
@@ -85,7 +172,7 @@ def add_to_body(
 
 @wp.func
 def add_pair(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair, bar: PairBar, twists: Virtual
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair, bar: MetPair, twists: Virtual
 ):
     """Add derivatives by what a pair with points is at the start of a step."""
     index = scene.pair_index[found.pair]
@@ -93,8 +180,6 @@ def add_pair(
     add_to_body(scene, room, world, index.second, bar.second, twists.second, twists.second_virtual)
     room.bars.bodies[world, index.first].scale += bar.scale
     room.bars.timestep[world, 0] += bar.timestep
-    room.bars.pairs[world, found.pair].sink += bar.sink
-    room.bars.pairs[world, found.pair].impact_depth += bar.depth
 
 
 @after_adjoints

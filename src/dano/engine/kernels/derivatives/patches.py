@@ -1,30 +1,140 @@
 """Derivatives of patches: by the states of two bodies that touch, from a virtual work (docs/gradients.md).
 
-What only skips work, balls around samples and maps of where a density is positive, has none.
+First the work of the wrench of a patch along virtual velocities, from the sums over samples on; then what
+these ask of each sample's density, and of the poses of both bodies. What only skips work, balls around samples
+and maps of where a density is positive, has no derivatives.
 """
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import Virtual
-from dano.engine.kernels.derivatives.contact import pull_distance
-from dano.engine.kernels.derivatives.pair_changes import add_density_changes
-from dano.engine.kernels.derivatives.patch_adjoint import (
-    grid_work,
-    patch_work,
-    plane_work,
-    sample_sums_work,
-    shell_work,
-    view_work,
-)
-from dano.engine.kernels.derivatives.products import add_to_leaf, summed_view, total_view
-from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.patch_tables import PatchSideIndex
+from dano.engine.kernels.derivatives.adjoint import need_adjoints, Virtual
+from dano.engine.kernels.derivatives.contact import add_part, add_to_leaf, n_moving, pull_distance
+from dano.engine.kernels.lanes import total_of, wait
+from dano.engine.kernels.patch_tables import PatchContact, PatchSideIndex, PatchTables
 from dano.engine.kernels.patches import contact_of, frame_of, next_block, side_field
-from dano.engine.kernels.tables import BLOCK, FoundPair, Room, Scene
+from dano.engine.kernels.tables import BLOCK, FoundPair, Given, GivenPatches, Room, Scene
 from dano.physics.features import KINDS, LANES
-from dano.physics.overlap import densest, DENSITY, Density, Field, seen_density, Sums, View, view_of
-from dano.physics.real import vec3, ZERO
-from dano.physics.solids.distances import leaf_distance
+from dano.physics.overlap import (
+    added,
+    cap_patch,
+    densest,
+    DENSITY,
+    Density,
+    Field,
+    grid_density,
+    in_leaf,
+    Patch,
+    patch_of,
+    plane_density,
+    sample_sums,
+    seen_density,
+    shell_density,
+    Sums,
+    sums_in_world,
+    View,
+    view_of,
+)
+from dano.physics.patch_law import patch_law
+from dano.physics.real import ONE, real, vec3, ZERO
+from dano.physics.solids.distances import leaf_distance, Solid
+from dano.physics.solids.grids import moved_kind, moved_solids
+from dano.physics.solids.kinds import HALF_SPACE, SPHERE
+from dano.physics.solids.leaves import Solids
+from dano.physics.structures import product_of, sum_of, vjp_of
+from dano.physics.twists import relative_twist
+
+
+@wp.func
+def patch_of_sides(
+    given: Given,
+    patches: GivenPatches,
+    tables: PatchTables,
+    world: int,
+    contact: PatchContact,
+) -> Patch:
+    """The patch of a contact from the sums over the samples of its sides."""
+    patch = Patch()
+    whole = Sums()
+    is_cap = bool(False)
+    for k in range(2):
+        if k < contact.sides:
+            s = contact.first_side + k
+            index = tables.side_index[s]
+            sampled = frame_of(given.seen[world, index.sampled])
+            queried = frame_of(given.seen[world, index.queried])
+            mass = given.bodies[world, index.sampled].mass
+            sign = wp.where(index.sampled == contact.first, ONE, -ONE)
+            if index.ball >= 0:
+                if wp.static(SPHERE in KINDS and HALF_SPACE in KINDS):
+                    plane = tables.fields.kinds[index.first_part].first_leaf
+                    patch = cap_patch(
+                        patches.leaves[world, index.ball],
+                        patches.leaves[world, plane],
+                        sampled,
+                        queried,
+                        mass,
+                    )
+                    patch.normal = sign * patch.normal
+                    is_cap = True
+            else:
+                own = patches.sums[world, s]
+                if own.share > ZERO:
+                    mass = mass * patches.sides[world, s].density_scale
+                    whole = added(whole, sums_in_world(own, sampled, queried, mass, sign))
+    if not is_cap:
+        patch = patch_of(whole, ZERO)
+    return patch
+
+
+@wp.func
+def patch_work(
+    given: Given,
+    patches: GivenPatches,
+    tables: PatchTables,
+    world: int,
+    c: int,
+    twists: Virtual,
+) -> real:
+    """Work of the impulse of a patch along the virtual velocities of its bodies."""
+    contact = tables.contacts[c]
+    patch = patch_of_sides(given, patches, tables, world, contact)
+    first = given.seen[world, contact.first].position
+    apart = first - given.seen[world, contact.second].position
+    arm = patch.centroid - first
+    twist = relative_twist(twists.first, twists.second, apart)
+    virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
+    slip = twist.velocity + wp.cross(twist.spin, arm)
+    found = patch_law(patches.patch_materials[world, c], patch, contact.adhesive > 0, slip, twist.spin)
+    moved = virtual.velocity + wp.cross(virtual.spin, arm)
+    return given.timestep[world, 0] * (wp.dot(found.force, moved) + wp.dot(found.moment, virtual.spin))
+
+
+@wp.func
+def grid_at(solids: Solids, world: int, solid: Solid, x: vec3) -> Density:
+    """Density of a grid at a point."""
+    return grid_density(solids, world, solid.kind, solid.leaf, in_leaf(solid.leaf, x))
+
+
+@wp.func
+def view_at(
+    given: Given, patches: GivenPatches, world: int, sampled: int, queried: int, field: Field
+) -> View:
+    """A field as the samples of another body see it."""
+    solid = field.solid
+    solid.leaf = patches.leaves[world, field.solid.first]
+    own = field
+    own.solid = solid
+    return view_of(own, frame_of(given.seen[world, sampled]), frame_of(given.seen[world, queried]))
+
+
+sample_sums_work, plane_work, shell_work = map(vjp_of, (sample_sums, plane_density, shell_density))
+grid_work, view_work = vjp_of(grid_at), vjp_of(view_at)
+summed_view, total_view = sum_of(View), total_of(View)
+density_product = product_of(Density)
+
+for _function in (patch_work, sample_sums_work, plane_work, shell_work, grid_work, view_work):
+    need_adjoints(_function)
+
 
 _LANES, _BLOCK, _DENSITY = wp.constant(LANES), wp.constant(BLOCK), wp.constant(DENSITY)
 
@@ -43,7 +153,11 @@ def pull_place(
         if is_grid:
             _a, _b, by_grid, by_place, _c = wp.grad(grid_work)(scene.solids, world, solid, x, bar)
             add_to_leaf(room.bars.leaves, world, solid.first, by_grid.leaf)
-            add_density_changes(scene, room, world, lane, solid, x, bar)
+            for k in range(n_moving(scene, room)):
+                kind = moved_kind(scene.solids, solid.kind, k)
+                moved = moved_solids(scene.solids)
+                change = grid_density(moved, world, kind, solid.leaf, in_leaf(solid.leaf, x))
+                add_part(room, world, lane, k, density_product(bar, change))
             found = by_place
     if not is_grid:
         d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
@@ -108,14 +222,13 @@ def pull_side(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, s
     view = view_of(field, sampled, frame_of(room.bodies[world, index.queried]))
     by_view = pull_weighted(scene, room, world, lane, index, field, view, room.patches.sum_bars[world, s])
     if lane == 0:
-        _a, _b, _c, _d, _e, _f, _g, _h = wp.grad(view_work)(
+        _a, _b, _c, _d, _e, _f, _g = wp.grad(view_work)(
             room.given,
             room.given_patches,
             world,
             index.sampled,
             index.queried,
             field,
-            field.solid.first,
             by_view,
         )
 
@@ -124,7 +237,7 @@ def pull_side(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, s
 def pull_patch(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, found: FoundPair, twists: Virtual
 ) -> Virtual:
-    """Derivatives by the twists of the bodies of a patch that touches, for the first lane; adds all others."""
+    """Derivatives by the twists of the bodies of a patch, for the first lane; adds all others."""
     c = contact_of(scene, found)
     contact = scene.patches.contacts[c]
     bar = Virtual()

@@ -9,28 +9,35 @@ directions.
 import warp as wp
 
 from dano.engine.kernels.derivatives.adjoint import after_adjoints
+from dano.engine.kernels.derivatives.contact import add_part
 from dano.engine.kernels.derivatives.equations import is_moved, pull_end, pull_equations, take_step
-from dano.engine.kernels.derivatives.pair_changes import (
-    change_by_samples,
-    change_by_weighted,
-    clear_samples,
-    clear_weighted,
-)
-from dano.engine.kernels.derivatives.products import unit_row, unit_vector
 from dano.engine.kernels.derivatives.pullback import begin
 from dano.engine.kernels.derivatives.trees import follow_chains
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.linear_solve import copy_blocks, EVERYWHERE, solve_blocks
-from dano.engine.kernels.patches import n_patches
+from dano.engine.kernels.patches import contact_of, n_patches
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.settled import settle
-from dano.engine.kernels.tables import Ends, Room, Scene, StateRow
+from dano.engine.kernels.tables import BLOCK, Ends, FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import eliminate_joint_duals, solve_trees
 from dano.physics.features import LANES, PATCHES, TREES
+from dano.physics.overlap import WeightedSample
 from dano.physics.pairs import BodyState
-from dano.physics.real import ONE, real, vec6, ZERO
+from dano.physics.real import ONE, vec6, ZERO
+from dano.physics.samples import Sample
+from dano.physics.structures import product_of
 
-_LANES = wp.constant(LANES)
+_LANES, _BLOCK = wp.constant(LANES), wp.constant(BLOCK)
+
+sample_product, weighted_product = product_of(Sample), product_of(WeightedSample)
+
+
+@wp.func
+def unit_vector(k: int) -> vec6:
+    """The k-th unit vector."""
+    unit = vec6()
+    unit[k] = ONE
+    return unit
 
 
 @wp.func
@@ -38,89 +45,46 @@ def clear_bars(scene: wp.ref[Scene], room: wp.ref[Room], ends: wp.ref[Ends], wor
     """Ask for nothing: zero all derivatives, but those by samples, which are used up."""
     for i in range(lane, ends.bars.shape[1], _LANES):
         ends.bars[world, i] = ZERO
-    for i in range(lane, room.splines.shape[1], _LANES):
-        room.splines[world, i] = ZERO
+    for i in range(lane, ends.after.shape[1], _LANES):
+        ends.after[world, i] = ZERO
+    for i in range(lane, room.parts.shape[1], _LANES):
+        room.parts[world, i] = ZERO
     if lane == 0:
         for b in range(scene.n_blocks):
             room.step[world, b] = vec6()
             room.late[world, b] = vec6()
         for i in range(scene.body_index.shape[0]):
-            room.after_bar[world, i] = StateRow()
             room.body_bars[world, i] = BodyState()
-        for c in range(scene.trees.coordinates.shape[0]):
-            room.trees.q_after[world, c] = ZERO
-            room.trees.v_after[world, c] = ZERO
     wait()
 
 
 @wp.func
-def take_changes(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    launch: wp.ref[Launch],
-    ends: wp.ref[Ends],
-    world: int,
-    t: int,
-    d: int,
+def use_samples(room: wp.ref[Room], ends: wp.ref[Ends], world: int, lane: int, found: FoundPair):
+    """Take what changes of samples that touch make of a number; derivatives by them are used up."""
+    n = room.bars.samples.shape[1]
+    for k in range(found.first, found.end):
+        s = room.where[world, k].sample
+        bar = room.bars.samples[world, s]
+        room.bars.samples[world, s] = Sample()
+        for d in range(ends.samples.shape[1] // n):
+            add_part(room, world, lane, d, sample_product(bar, ends.samples[world, d * n + s]))
+
+
+@wp.func
+def use_weighted(
+    scene: wp.ref[Scene], room: wp.ref[Room], ends: wp.ref[Ends], world: int, lane: int, found: FoundPair
 ):
-    """Changes in a direction of what a step is given that others are not, the first numbers of `Given`."""
-    n = scene.body_index.shape[0]
-    k = scene.trees.coordinates.shape[0]
-    at = d * ends.bars.shape[1]
-    before = d * launch.n_steps + t - 1
-    for i in range(n):
-        if t > 0:
-            row = ends.states[world, before * n + i]
-            for c in range(3):
-                room.moving[world, at + 13 * i + c] = row.position[c]
-                room.moving[world, at + 13 * i + 7 + c] = row.velocity[c]
-                room.moving[world, at + 13 * i + 10 + c] = row.omega[c]
-            for c in range(4):
-                room.moving[world, at + 13 * i + 3 + c] = row.orientation[c]
-        if ends.pushes.shape[1] > 0:
-            push = ends.pushes[world, (before + 1) * n + i]
-            for c in range(3):
-                room.moving[world, at + 13 * n + 2 * k + 6 * i + c] = push.force[c]
-                room.moving[world, at + 13 * n + 2 * k + 6 * i + 3 + c] = push.torque[c]
-    for c in range(k):
-        if t > 0:
-            room.moving[world, at + 13 * n + c] = ends.qs[world, before * k + c]
-            room.moving[world, at + 13 * n + k + c] = ends.vs[world, before * k + c]
-        if ends.efforts.shape[1] > 0:
-            room.moving[world, at + 19 * n + 2 * k + c] = ends.efforts[world, (before + 1) * k + c]
-        if ends.commands.shape[1] > 0:
-            room.moving[world, at + 19 * n + 3 * k + c] = ends.commands[world, (before + 1) * k + c]
-
-
-@wp.func
-def row_change(room: wp.ref[Room], world: int, at: int) -> StateRow:
-    """Change of a body's state at the start of a step, from where its numbers begin."""
-    row = StateRow()
-    for c in range(3):
-        row.position[c] = room.moving[world, at + c]
-        row.velocity[c] = room.moving[world, at + 7 + c]
-        row.omega[c] = room.moving[world, at + 10 + c]
-    for c in range(4):
-        row.orientation[c] = room.moving[world, at + 3 + c]
-    return row
-
-
-@wp.func
-def add_along(room: wp.ref[Room], world: int, lane: int, d: int, change: real):
-    """Add the parts of all lanes of what the changes in a direction make of a number."""
-    whole = total(change)
-    if lane == 0:
-        room.along[world, d] = room.along[world, d] + whole
-
-
-@wp.func
-def clear_touching(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, f: int):
-    """Zero the derivatives by samples of a pair."""
-    found = room.found[world, f * _LANES + lane]
-    clear_samples(room, world, found)
-    if wp.static(PATCHES):
-        if f >= n_found:
-            clear_weighted(scene, room, world, lane, found)
+    """… of the weighted samples of a contact."""
+    n = room.bars.weighted.shape[1]
+    contact = scene.patches.contacts[contact_of(scene, found)]
+    for side in range(contact.first_side, contact.first_side + contact.sides):
+        index = scene.patches.side_index[side]
+        begins = _BLOCK * index.first_block
+        for s in range(begins + lane, begins + _BLOCK * index.blocks, _LANES):
+            bar = room.bars.weighted[world, s]
+            room.bars.weighted[world, s] = WeightedSample()
+            for d in range(ends.weighted.shape[1] // n):
+                add_part(room, world, lane, d, weighted_product(bar, ends.weighted[world, d * n + s]))
 
 
 @wp.func
@@ -136,27 +100,20 @@ def change_along(
     """What the changes in each direction make of a number, from its derivatives, in `room.along`."""
     n = ends.bars.shape[1]
     wait()
+    if room.bars.samples.shape[1] > 0:
+        for f in range(n_found):
+            use_samples(room, ends, world, lane, room.found[world, f * _LANES + lane])
+    if wp.static(PATCHES):
+        if room.bars.weighted.shape[1] > 0:
+            for f in range(n_found, n_found + n_patches(room, world)):
+                use_weighted(scene, room, ends, world, lane, room.found[world, f * _LANES + lane])
     for d in range(launch.n_directions):
-        change = real(0.0)
+        change = room.parts[world, d * _LANES + lane]
         for i in range(lane, n, _LANES):
             change += ends.bars[world, i] * room.moving[world, d * n + i]
-        if room.splines.shape[1] > 0:
-            change += room.splines[world, d * _LANES + lane]
+        change = total(change)
         if lane == 0:
-            room.along[world, d] = ZERO
-        add_along(room, world, lane, d, change)
-    if room.bars.samples.shape[1] > 0 or room.bars.weighted.shape[1] > 0:
-        # A sample that touches several bodies counts with the first of them.
-        for f in range(n_found + n_patches(room, world)):
-            found = room.found[world, f * _LANES + lane]
-            for d in range(launch.n_directions):
-                of_samples = change_by_samples(room, ends, world, found, d)
-                if wp.static(PATCHES):
-                    if f >= n_found:
-                        of_samples = change_by_weighted(scene, room, ends, world, lane, found, d)
-                add_along(room, world, lane, d, of_samples)
-            clear_touching(scene, room, world, lane, n_found, f)
-            wait()
+            room.along[world, d] = change
     wait()
 
 
@@ -253,59 +210,34 @@ def push_end(
     n_found: int,
 ):
     """Changes of a step's end in all directions, from those of its velocities in `room.missing`."""
-    n = scene.body_index.shape[0]
-    k = scene.trees.coordinates.shape[0]
+    n = ends.after.shape[1]
     m = scene.n_blocks
-    if lane == 0:
-        for d in range(launch.n_directions):
-            for i in range(n):
-                # What does not move ends as it begins.
-                begins = StateRow()
-                if scene.body_index[i].row < 0:
-                    begins = row_change(room, world, d * ends.bars.shape[1] + 13 * i)
-                ends.states[world, (d * launch.n_steps + t) * n + i] = begins
     number = int(0)
-    while number < 13 * n + 2 * k:
+    while number < n:
         i = number // 13
-        if i < n:
-            if scene.body_index[i].row < 0:
-                number += 13
-                continue
-        c = number - 13 * n
-        unit = unit_row(number % 13)
+        moves = bool(True)
+        if i < scene.body_index.shape[0]:
+            moves = scene.body_index[i].row >= 0
         clear_bars(scene, room, ends, world, lane)
-        if lane == 0:
-            if c < 0:
-                room.after_bar[world, i] = unit
-            elif c < k:
-                room.trees.q_after[world, c] = ONE
-            else:
-                room.trees.v_after[world, c - k] = ONE
-            if wp.static(TREES):
-                follow_chains(scene, room, world)
-        wait()
-        pull_end(scene, room, launch, world, lane, t, n_found)
-        if wp.static(not TREES):
-            if is_late(scene, room, world):
-                pull_equations(scene, room, launch, world, lane, t, n_found)
-        change_along(scene, room, launch, ends, world, lane, n_found)
+        if moves:
+            if lane == 0:
+                ends.after[world, number] = ONE
+                if wp.static(TREES):
+                    follow_chains(scene, room, world)
+            wait()
+            pull_end(scene, room, launch, world, lane, t, n_found)
+            if wp.static(not TREES):
+                if is_late(scene, room, world):
+                    pull_equations(scene, room, launch, world, lane, t, n_found)
+            change_along(scene, room, launch, ends, world, lane, n_found)
         if lane == 0:
             for d in range(launch.n_directions):
-                change = room.along[world, d]
-                for b in range(m):
-                    change += wp.dot(room.residual[world, b], room.missing[world, d * m + b])
-                at = d * launch.n_steps + t
-                if c < 0:
-                    moved = ends.states[world, at * n + i]
-                    moved.position += change * unit.position
-                    moved.orientation += change * unit.orientation
-                    moved.velocity += change * unit.velocity
-                    moved.omega += change * unit.omega
-                    ends.states[world, at * n + i] = moved
-                elif c < k:
-                    ends.qs[world, at * k + c] = change
-                else:
-                    ends.vs[world, at * k + c - k] = change
+                change = room.moving[world, d * ends.bars.shape[1] + number]
+                if moves:
+                    change = room.along[world, d]
+                    for b in range(m):
+                        change += wp.dot(room.residual[world, b], room.missing[world, d * m + b])
+                ends.ends[world, (d * launch.n_steps + t) * n + number] = change
         wait()
         number += 1
 
@@ -315,18 +247,28 @@ def pushforward(scene: Scene, room: Room, launch: Launch, ends: Ends):
     """Changes of the ends of steps, from those of everything that a rollout is given."""
     block, lane = wp.tid()
     world = launch.first_world + block
-    begin(scene, room, ends, world, lane)
+    begin(ends, world, lane)
     for i in range(lane, ends.changes.shape[1], _LANES):
         room.moving[world, i] = ends.changes[world, i]
+    for i in range(lane, room.bars.samples.shape[1], _LANES):
+        room.bars.samples[world, i] = Sample()
+    for i in range(lane, room.bars.weighted.shape[1], _LANES):
+        room.bars.weighted[world, i] = WeightedSample()
+    # A state, and the controls of a step: the numbers that a step is given first.
+    n = ends.after.shape[1]
+    m = ends.controls.shape[1] // (launch.n_directions * launch.n_steps)
     for t in range(launch.n_steps):
         n_found = settle(scene, room, launch, world, lane, t)
-        wait()
         if lane == 0:
             take_step(scene, room, launch, world, t)
-            for d in range(launch.n_directions):
-                take_changes(scene, room, launch, ends, world, t, d)
-        for f in range(n_found + n_patches(room, world)):
-            clear_touching(scene, room, world, lane, n_found, f)
+        for d in range(launch.n_directions):
+            at = d * ends.bars.shape[1]
+            step = d * launch.n_steps + t
+            if t > 0:
+                for i in range(lane, n, _LANES):
+                    room.moving[world, at + i] = ends.ends[world, (step - 1) * n + i]
+            for i in range(lane, m, _LANES):
+                room.moving[world, at + n + i] = ends.controls[world, step * m + i]
         wait()
         push_equations(scene, room, launch, ends, world, lane, t, n_found)
         push_end(scene, room, launch, ends, world, lane, t, n_found)
