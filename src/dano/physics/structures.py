@@ -1,10 +1,12 @@
-"""Arithmetic of structures, number by number. Warp has none: it is written here from a structure's fields.
+"""Arithmetic of structures, number by number, and what derivatives of functions need.
 
-A field more needs nothing else. Only real numbers take part.
+Warp has no such arithmetic: it is written here from a structure's fields. A field more needs nothing else.
+Only real numbers take part.
 """
 
 import linecache
 from collections.abc import Callable, Sequence
+from types import CodeType
 from typing import Any
 
 import warp as wp
@@ -98,6 +100,34 @@ def vjp_of(function: Any) -> Any:
     call = f"f({', '.join(kinds)})"
     lines = [f"def vjp({head}) -> real:", f"    return {product.format(call)}"]
     return written(function, "vjp", lines, names)
+
+
+def need_adjoints(function: Any, seen: set[int] | None = None) -> None:
+    """Have Warp generate the adjoint of a function and of all that it calls.
+
+    `wp.grad` asks for it by itself where nothing called the function before in the same kernel. Formulas of a
+    step have been called before, and would be left without: their derivatives would be zero without a word.
+    """
+    seen = set() if seen is None else seen
+    if id(function) in seen:
+        return
+    seen.add(id(function))
+    function.adj.force_adjoint_codegen = True
+    for name in _names_in(function.func.__code__):
+        called = function.func.__globals__.get(name)
+        if isinstance(called, wp.Function):
+            need_adjoints(called, seen)
+
+
+def after_adjoints(function: Any) -> Any:
+    """Have Warp emit a function after all adjoints, as those that call `wp.grad`: it calls one of them."""
+    function.adj.uses_grad_call = True
+    return function
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """Global names that a function's code may refer to."""
+    return set(code.co_names).union(*(_names_in(c) for c in code.co_consts if isinstance(c, CodeType)))
 
 
 def fields_of(structure: Any) -> list[tuple[str, Any]]:

@@ -10,9 +10,6 @@ What a function reads of an array whose `grad` points somewhere, Warp adds the d
 samples depend on is a structure by value, whose derivatives are summed before they are added.
 """
 
-from types import CodeType
-from typing import Any
-
 import warp as wp
 
 from dano.engine.kernels.impacts import support_before, support_delayed
@@ -53,7 +50,7 @@ from dano.physics.rotations import from_wxyz, interpolated, matrix, to_wxyz, tur
 from dano.physics.samples import point_contact, position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.leaves import Distance, Solids
-from dano.physics.structures import product_of, vjp_of
+from dano.physics.structures import need_adjoints, product_of, vjp_of
 from dano.physics.twists import angular_part, joined, linear_part, relative_twist, wrench_at
 
 PRESSES, MEETS, RESTS = 0, 1, 2
@@ -381,34 +378,6 @@ def support_work(
 def fall_work(at: MetPair, depth: real, bar: real) -> real:
     """⟨bar, how far bodies fall in a step⟩."""
     return bar * fall_of(at.first, at.second, depth, at.timestep)
-
-
-def need_adjoints(function: Any, seen: set[int] | None = None) -> None:
-    """Have Warp generate the adjoint of a function and of all that it calls.
-
-    `wp.grad` asks for it by itself where nothing called the function before in the same kernel. Formulas of a
-    step have been called before, and would be left without: their derivatives would be zero without a word.
-    """
-    seen = set() if seen is None else seen
-    if id(function) in seen:
-        return
-    seen.add(id(function))
-    function.adj.force_adjoint_codegen = True
-    for name in _names_in(function.func.__code__):
-        called = function.func.__globals__.get(name)
-        if isinstance(called, wp.Function):
-            need_adjoints(called, seen)
-
-
-def after_adjoints(function: Any) -> Any:
-    """Have Warp emit a function after all adjoints, as those that call `wp.grad`: it calls one of them."""
-    function.adj.uses_grad_call = True
-    return function
-
-
-def _names_in(code: CodeType) -> set[str]:
-    """Global names that a function's code may refer to."""
-    return set(code.co_names).union(*(_names_in(c) for c in code.co_consts if isinstance(c, CodeType)))
 
 
 for _function in (

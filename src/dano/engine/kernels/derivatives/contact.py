@@ -4,7 +4,6 @@ import warp as wp
 
 from dano.engine.kernels.assembly import presses
 from dano.engine.kernels.derivatives.adjoint import (
-    after_adjoints,
     Asked,
     critical_work,
     distance_work,
@@ -37,7 +36,7 @@ from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.solids.grids import distance_change
 from dano.physics.solids.kinds import GRID
 from dano.physics.solids.leaves import Distance, Leaf
-from dano.physics.structures import adding_of, addition_of, product_of, scaled_of, sum_of
+from dano.physics.structures import adding_of, addition_of, after_adjoints, product_of, scaled_of, sum_of
 from dano.physics.twists import relative_twist
 
 _BALL, _GRID, _LANES = wp.constant(BALL), wp.constant(GRID), wp.constant(LANES)

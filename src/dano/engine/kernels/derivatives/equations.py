@@ -5,7 +5,6 @@ import warp as wp
 from dano.engine.kernels.assembly import row_of, twist_of
 from dano.engine.kernels.derivatives.adjoint import (
     advance_work,
-    after_adjoints,
     late_work,
     MetPair,
     momentum_work,
@@ -27,7 +26,7 @@ from dano.engine.kernels.derivatives.trees import (
 )
 from dano.engine.kernels.impacts import freed, meetings_of, moving_of, pair_slope
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.linear_solve import copy_transposed_blocks, EVERYWHERE, solve_blocks
+from dano.engine.kernels.linear_solve import copy_blocks, copy_transposed_blocks, EVERYWHERE, solve_blocks
 from dano.engine.kernels.rollout import Launch, push_of, row_before
 from dano.engine.kernels.settled import block_of, hangs
 from dano.engine.kernels.tables import FoundPair, Room, Scene, StateRow
@@ -35,7 +34,7 @@ from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, real, vec6, ZERO
-from dano.physics.structures import product_of
+from dano.physics.structures import after_adjoints, product_of
 from dano.physics.twists import shift
 
 _LANES = wp.constant(LANES)
@@ -135,22 +134,31 @@ def take_step(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], 
 
 
 @wp.func
-def solve_transposed(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int):
-    """Virtual velocities λ of a settled step, (∂R/∂V)ᵀ λ = V̄, in `room.step`, from V̄ in `room.residual`."""
+def solve_settled(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, is_transposed: bool, again: bool
+):
+    """Solve ∂R/∂V of a settled step, or its transpose, for the right-hand side in `room.step`, in place.
+
+    Matrices of trees that touch nothing are factored once: not `again`.
+    """
     m = scene.n_blocks
-    copy_transposed_blocks(room, world, lane, m)
+    if is_transposed:
+        copy_transposed_blocks(room, world, lane, m)
+    else:
+        copy_blocks(room, world, lane, m, EVERYWHERE)
     wait()
-    if lane == 0:
-        for b in range(m):
-            room.step[world, b] = room.residual[world, b]
-        if wp.static(TREES):
-            transpose_entries(scene, room, world)
-            eliminate_joint_duals(scene, room, world, False)
-    wait()
-    solve_blocks(room, world, lane, m, EVERYWHERE)
     if wp.static(TREES):
         if lane == 0:
-            solve_trees(scene, room, world, False)
+            if is_transposed:
+                transpose_entries(scene, room, world)
+            eliminate_joint_duals(scene, room, world, again)
+        wait()
+    solve_blocks(room, world, lane, m, EVERYWHERE)
+    wait()
+    if wp.static(TREES):
+        if lane == 0:
+            solve_trees(scene, room, world, again)
+        wait()
 
 
 @wp.func

@@ -1,13 +1,13 @@
 """Derivatives of patches: by the states of two bodies that touch, from a virtual work (docs/gradients.md).
 
 First the work of the wrench of a patch along virtual velocities, from the sums over samples on; then what
-these ask of each sample's density, and of the poses of both bodies. What only skips work, balls around samples
-and maps of where a density is positive, has no derivatives.
+these ask of each sample's density, and of the poses of both bodies. What only skips work, balls around
+samples and maps of where a density is positive, has no derivatives.
 """
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import need_adjoints, Virtual
+from dano.engine.kernels.derivatives.adjoint import Virtual
 from dano.engine.kernels.derivatives.contact import add_part, add_to_leaf, n_moving, pull_distance
 from dano.engine.kernels.lanes import total_of, wait
 from dano.engine.kernels.patch_tables import PatchContact, PatchSideIndex, PatchTables
@@ -40,7 +40,7 @@ from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.grids import moved_kind, moved_solids
 from dano.physics.solids.kinds import HALF_SPACE, SPHERE
 from dano.physics.solids.leaves import Solids
-from dano.physics.structures import product_of, sum_of, vjp_of
+from dano.physics.structures import need_adjoints, product_of, sum_of, vjp_of
 from dano.physics.twists import relative_twist
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.equations import pull_end, pull_equations, solve_transposed, take_step
+from dano.engine.kernels.derivatives.equations import pull_end, pull_equations, solve_settled, take_step
 from dano.engine.kernels.derivatives.trees import follow_chains
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.rollout import Launch
@@ -50,8 +50,12 @@ def pullback(scene: Scene, room: Room, launch: Launch, ends: Ends):
                 follow_chains(scene, room, world)
         wait()
         pull_end(scene, room, launch, world, lane, t, n_found)
-        solve_transposed(scene, room, world, lane)
+        # Virtual velocities λ, (∂R/∂V)ᵀ λ = V̄.
+        if lane == 0:
+            for b in range(scene.n_blocks):
+                room.step[world, b] = room.residual[world, b]
         wait()
+        solve_settled(scene, room, world, lane, True, False)
         pull_equations(scene, room, launch, world, lane, t, n_found)
         # The start of a step is the end of the one before; its controls belong to it alone.
         for i in range(lane, n, _LANES):

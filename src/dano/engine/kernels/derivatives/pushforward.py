@@ -8,24 +8,27 @@ directions.
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import after_adjoints
 from dano.engine.kernels.derivatives.contact import add_part
-from dano.engine.kernels.derivatives.equations import is_moved, pull_end, pull_equations, take_step
+from dano.engine.kernels.derivatives.equations import (
+    is_moved,
+    pull_end,
+    pull_equations,
+    solve_settled,
+    take_step,
+)
 from dano.engine.kernels.derivatives.pullback import begin
-from dano.engine.kernels.derivatives.trees import follow_chains
+from dano.engine.kernels.derivatives.trees import ask_of_end, follow_chains
 from dano.engine.kernels.lanes import total, wait
-from dano.engine.kernels.linear_solve import copy_blocks, EVERYWHERE, solve_blocks
 from dano.engine.kernels.patches import contact_of, n_patches
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.settled import settle
 from dano.engine.kernels.tables import BLOCK, Ends, FoundPair, Room, Scene
-from dano.engine.kernels.trees.balance import eliminate_joint_duals, solve_trees
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.overlap import WeightedSample
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, vec6, ZERO
 from dano.physics.samples import Sample
-from dano.physics.structures import product_of
+from dano.physics.structures import after_adjoints, product_of
 
 _LANES, _BLOCK = wp.constant(LANES), wp.constant(BLOCK)
 
@@ -42,9 +45,7 @@ def unit_vector(k: int) -> vec6:
 
 @wp.func
 def clear_bars(scene: wp.ref[Scene], room: wp.ref[Room], ends: wp.ref[Ends], world: int, lane: int):
-    """Ask for nothing: zero all derivatives, but those by samples, which are used up."""
-    for i in range(lane, ends.bars.shape[1], _LANES):
-        ends.bars[world, i] = ZERO
+    """Ask for nothing: derivatives but these are used up, see `change_along`."""
     for i in range(lane, ends.after.shape[1], _LANES):
         ends.after[world, i] = ZERO
     for i in range(lane, room.parts.shape[1], _LANES):
@@ -97,9 +98,15 @@ def change_along(
     lane: int,
     n_found: int,
 ):
-    """What the changes in each direction make of a number, from its derivatives, in `room.along`."""
+    """What the changes in each direction make of a number, in `room.along`; its derivatives are used up."""
     n = ends.bars.shape[1]
     wait()
+    for i in range(lane, n, _LANES):
+        bar = ends.bars[world, i]
+        if bar != ZERO:
+            ends.bars[world, i] = ZERO
+            for d in range(launch.n_directions):
+                add_part(room, world, lane, d, bar * room.moving[world, d * n + i])
     if room.bars.samples.shape[1] > 0:
         for f in range(n_found):
             use_samples(room, ends, world, lane, room.found[world, f * _LANES + lane])
@@ -108,37 +115,10 @@ def change_along(
             for f in range(n_found, n_found + n_patches(room, world)):
                 use_weighted(scene, room, ends, world, lane, room.found[world, f * _LANES + lane])
     for d in range(launch.n_directions):
-        change = room.parts[world, d * _LANES + lane]
-        for i in range(lane, n, _LANES):
-            change += ends.bars[world, i] * room.moving[world, d * n + i]
-        change = total(change)
+        change = total(room.parts[world, d * _LANES + lane])
         if lane == 0:
             room.along[world, d] = change
     wait()
-
-
-@wp.func
-def solve_directions(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, lane: int):
-    """Changes of the velocities, in place of those of the equations, in `room.missing`."""
-    m = scene.n_blocks
-    for d in range(launch.n_directions):
-        copy_blocks(room, world, lane, m, EVERYWHERE)
-        wait()
-        if lane == 0:
-            for b in range(m):
-                room.step[world, b] = room.missing[world, d * m + b]
-            if wp.static(TREES):
-                # Matrices of trees that touch nothing are factored once.
-                eliminate_joint_duals(scene, room, world, d > 0)
-        wait()
-        solve_blocks(room, world, lane, m, EVERYWHERE)
-        wait()
-        if lane == 0:
-            if wp.static(TREES):
-                solve_trees(scene, room, world, d > 0)
-            for b in range(m):
-                room.missing[world, d * m + b] = room.step[world, b]
-        wait()
 
 
 @wp.func
@@ -183,7 +163,16 @@ def push_equations(
         if k >= used_of(scene, block):
             block += 1
             k = 0
-    solve_directions(scene, room, launch, world, lane)
+    for d in range(launch.n_directions):
+        if lane == 0:
+            for b in range(m):
+                room.step[world, b] = room.missing[world, d * m + b]
+        wait()
+        solve_settled(scene, room, world, lane, False, d > 0)
+        if lane == 0:
+            for b in range(m):
+                room.missing[world, d * m + b] = room.step[world, b]
+        wait()
 
 
 @wp.func
@@ -212,18 +201,21 @@ def push_end(
     """Changes of a step's end in all directions, from those of its velocities in `room.missing`."""
     n = ends.after.shape[1]
     m = scene.n_blocks
+    clear_bars(scene, room, ends, world, lane)
+    if wp.static(TREES):
+        if lane == 0:
+            follow_chains(scene, room, world)
+        wait()
     number = int(0)
     while number < n:
         i = number // 13
         moves = bool(True)
         if i < scene.body_index.shape[0]:
             moves = scene.body_index[i].row >= 0
-        clear_bars(scene, room, ends, world, lane)
         if moves:
+            clear_bars(scene, room, ends, world, lane)
             if lane == 0:
                 ends.after[world, number] = ONE
-                if wp.static(TREES):
-                    follow_chains(scene, room, world)
             wait()
             pull_end(scene, room, launch, world, lane, t, n_found)
             if wp.static(not TREES):
@@ -254,6 +246,9 @@ def pushforward(scene: Scene, room: Room, launch: Launch, ends: Ends):
         room.bars.samples[world, i] = Sample()
     for i in range(lane, room.bars.weighted.shape[1], _LANES):
         room.bars.weighted[world, i] = WeightedSample()
+    if wp.static(TREES):
+        if lane == 0:
+            ask_of_end(scene, room, world)
     # A state, and the controls of a step: the numbers that a step is given first.
     n = ends.after.shape[1]
     m = ends.controls.shape[1] // (launch.n_directions * launch.n_steps)

@@ -1,13 +1,13 @@
 """Derivatives of bodies on joints: sweeps from the tips of trees to their roots (docs/gradients.md).
 
 A body on a joint stands and moves as the body that carries it says: each joint is a function from one `Chain`
-to the next, and derivatives go through it from the tips to the roots. What is differentiated stands first: see
-`dano.engine.kernels.derivatives.adjoint`.
+to the next, and derivatives go through it from the tips to the roots. What is differentiated stands
+first: see `dano.engine.kernels.derivatives.adjoint`.
 """
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import momentum_gained, need_adjoints
+from dano.engine.kernels.derivatives.adjoint import momentum_gained
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Given, GivenTrees, Room, Scene, StateRow
 from dano.engine.kernels.trees.kinematics import unknown_of, velocities_of
@@ -16,7 +16,7 @@ from dano.engine.kernels.trees.tables import Chain, Coordinate, HangingBar, Loop
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, quat, real, vec3, vec4, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turn_of_step
-from dano.physics.structures import vjp_of
+from dano.physics.structures import need_adjoints, vjp_of
 from dano.physics.trees.joint_laws import joint_momentum, joint_ramps, JointDrive, ramps_force
 from dano.physics.trees.joints import (
     BALL,
@@ -110,16 +110,9 @@ def hanging_chain(
     virtual: vec3,
     origin: vec3,
 ) -> Chain:
-    """Of a body on a joint.
+    """Of a body on a joint, with velocities y of its coordinates at the end [rad/s or m/s].
 
-    Args:
-        given: What the step is given.
-        trees: …
-        world: Which world.
-        node: The body.
-        y: Velocities of its joint at the end of the step [rad/s or m/s].
-        virtual: Virtual ones.
-        origin: Of the tree [m, W]: sums of works do not depend on it.
+    `origin` is that of the tree [m, W]: sums of works do not depend on it.
     """
     found = Chain()
     h = given.timestep[world, 0]
@@ -164,18 +157,7 @@ def hanging_body_work(
     bar: HangingBar,
     state_bar: BodyState,
 ) -> real:
-    """Work of what a body's momentum gains, and ⟨bars, what contact and the end of the step ask of it⟩.
-
-    Args:
-        given: What the step is given.
-        trees: …
-        world: Which world.
-        n: Node of the body.
-        i: The body, on a joint.
-        origin: Of its tree [m, W].
-        bar: Derivatives by the rest.
-        state_bar: By how contact sees it at the start of the step.
-    """
+    """Work of what a body's momentum gains, and ⟨bars, what contact and the end of the step ask of it⟩."""
     chain = trees.chains[world, n]
     h = given.timestep[world, 0]
     row = given.state[world, i]
@@ -237,18 +219,7 @@ def coordinate_work(
     mass: real,
     virtual: real,
 ) -> real:
-    """Work of what acts on a coordinate along minus its virtual velocity.
-
-    Args:
-        given: What the step is given.
-        trees: …
-        world: Which world.
-        c: The coordinate.
-        coordinate: Its whole numbers.
-        y: Velocity at the end [rad/s or m/s].
-        mass: See `joint_ramps`.
-        virtual: The velocity.
-    """
+    """Work of what acts on a coordinate along minus its virtual velocity."""
     law = trees.laws[world, c]
     h = given.timestep[world, 0]
     law.least_effort = wp.max(law.least_effort, -_ENDLESS)
@@ -295,19 +266,7 @@ def loop_work(
     forces: vec6,
     virtual: vec6,
 ) -> real:
-    """Work of the forces in a loop, and of its gap along minus virtual ones.
-
-    Args:
-        given: What the step is given.
-        trees: …
-        world: Which world.
-        row: The loop.
-        index: Its whole numbers.
-        first_origin: Of the tree of its first body [m, W].
-        second_origin: Of the second.
-        forces: [N, N m].
-        virtual: Virtual forces.
-    """
+    """Work of the forces in a loop, and of its gap along minus virtual ones."""
     loop = trees.loops[world, row]
     first = chain_of(given, trees, world, index.first, index.first_body)
     second = chain_of(given, trees, world, index.second, index.second_body)
