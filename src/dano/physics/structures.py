@@ -1,10 +1,12 @@
-"""Arithmetic of structures, number by number. Warp has none: it is written here from a structure's fields.
+"""Arithmetic of structures, number by number, and what derivatives of functions need.
 
-A field more needs nothing else. Only real numbers take part.
+Warp has no such arithmetic: it is written here from a structure's fields. A field more needs nothing else.
+Only real numbers take part.
 """
 
 import linecache
 from collections.abc import Callable, Sequence
+from types import CodeType
 from typing import Any
 
 import warp as wp
@@ -33,30 +35,99 @@ def product_of(structure: Any) -> Any:
 
 def sum_of(structure: Any) -> Any:
     """Sum of two structures."""
-    lines = [f"    a.{name} = a.{name} + b.{name}" for name, _ in plain_fields(structure)]
-    return written(structure, "summed", ["def summed(a: S, b: S) -> S:", *lines, "    return a"])
-
-
-def adding_of(structure: Any) -> Any:
-    """Add a structure to another in place: where that is one of several ways to go on, nothing is copied."""
-    lines = [f"    a.{name} += b.{name}" for name, _ in plain_fields(structure)]
-    return written(structure, "adding", ["def adding(a: wp.ref[S], b: S):", *lines])
+    return _of_fields(
+        structure, "summed", "def summed(a: S, b: S) -> S:", "a.{0} + b.{0}", "{1}(a.{0}, b.{0})", sum_of
+    )
 
 
 def scaled_of(structure: Any) -> Any:
     """A number times a structure."""
-    lines = [f"    a.{name} = a.{name} * s" for name, _ in plain_fields(structure)]
-    return written(structure, "scaled", ["def scaled(s: real, a: S) -> S:", *lines, "    return a"])
+    return _of_fields(
+        structure, "scaled", "def scaled(s: real, a: S) -> S:", "a.{0} * s", "{1}(s, a.{0})", scaled_of
+    )
+
+
+def _of_fields(structure: Any, name: str, head: str, plain: str, nested: str, inner: Any) -> Any:
+    """A function that writes each field of a structure `a` anew, and returns it.
+
+    Args:
+        structure: The structure.
+        name: Of the function.
+        head: Its first line.
+        plain: What a field of numbers becomes; {0} is its name.
+        nested: What a structure within becomes; {1} is the function for it.
+        inner: Makes that function.
+    """
+    lines, names = [], {}
+    for field, kind in fields_of(structure):
+        if _is_structure(kind):
+            names[f"inner_{field}"] = inner(kind)
+            lines.append(f"    a.{field} = {nested.format(field, f'inner_{field}')}")
+        else:
+            lines.append(f"    a.{field} = {plain.format(field)}")
+    return written(structure, name, [head, *lines, "    return a"], names)
+
+
+def adding_of(structure: Any) -> Any:
+    """Add a structure to another in place: where that is one of several ways to go on, nothing is copied."""
+    lines = [f"    a.{name} = a.{name} + b.{name}" for name in leaf_names(structure)]
+    return written(structure, "adding", ["def adding(a: wp.ref[S], b: S):", *lines])
 
 
 def addition_of(structure: Any) -> Any:
-    """Add a structure to one of an array of shape (worlds, n), which may have no columns.
+    """Add a structure of numbers to one of an array of shape (worlds, n).
 
     Lanes may add to the same one: each number is added for itself.
     """
-    lines = [f"        sums[world, i].{name} += bar.{name}" for name, _ in plain_fields(structure)]
+    lines = [f"    sums[world, i].{name} += bar.{name}" for name in leaf_names(structure)]
     head = "def add(sums: wp.array2d(dtype=S), world: int, i: int, bar: S):"
-    return written(structure, "add", [head, "    if sums.shape[1] > 0:", *lines])
+    return written(structure, "add", [head, *lines])
+
+
+def vjp_of(function: Any) -> Any:
+    """⟨bar, f(…)⟩ of a function whose result is a vector or a structure: its gradient is f's derivative.
+
+    The arguments are those of f, then the bar.
+    """
+    kinds = dict(function.func.__annotations__)
+    result = kinds.pop("return")
+    takes = [*kinds, "bar"]
+    names = {"f": function, **{f"K{i}": kind for i, kind in enumerate([*kinds.values(), result])}}
+    product = "wp.dot(bar, {})"
+    if _is_structure(result):
+        names["product"], product = product_of(result), "product(bar, {})"
+    head = ", ".join(f"{name}: K{i}" for i, name in enumerate(takes))
+    call = f"f({', '.join(kinds)})"
+    lines = [f"def vjp({head}) -> real:", f"    return {product.format(call)}"]
+    return written(function, "vjp", lines, names)
+
+
+def need_adjoints(function: Any, seen: set[int] | None = None) -> None:
+    """Have Warp generate the adjoint of a function and of all that it calls.
+
+    `wp.grad` asks for it by itself where nothing called the function before in the same kernel. Formulas of a
+    step have been called before, and would be left without: their derivatives would be zero without a word.
+    """
+    seen = set() if seen is None else seen
+    if id(function) in seen:
+        return
+    seen.add(id(function))
+    function.adj.force_adjoint_codegen = True
+    for name in _names_in(function.func.__code__):
+        called = function.func.__globals__.get(name)
+        if isinstance(called, wp.Function):
+            need_adjoints(called, seen)
+
+
+def after_adjoints(function: Any) -> Any:
+    """Have Warp emit a function after all adjoints, as those that call `wp.grad`: it calls one of them."""
+    function.adj.uses_grad_call = True
+    return function
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """Global names that a function's code may refer to."""
+    return set(code.co_names).union(*(_names_in(c) for c in code.co_consts if isinstance(c, CodeType)))
 
 
 def fields_of(structure: Any) -> list[tuple[str, Any]]:
@@ -65,11 +136,17 @@ def fields_of(structure: Any) -> list[tuple[str, Any]]:
     return [(name, kind) for name, kind in kinds if kind not in _OTHERS]
 
 
-def plain_fields(structure: Any) -> list[tuple[str, Any]]:
-    """Names and types of the fields of a structure that holds numbers only."""
-    found = fields_of(structure)
-    nested = [name for name, kind in found if _is_structure(kind)]
-    assert not nested, f"{structure.key} must hold numbers only, got {', '.join(nested)}"
+def leaf_names(structure: Any) -> list[str]:
+    """Names of all numbers, vectors and matrices in a structure, those of structures within as "a.b"."""
+    return list(leaf_fields(structure))
+
+
+def leaf_fields(structure: Any) -> dict[str, Any]:
+    """The same with their types."""
+    found = {}
+    for name, kind in fields_of(structure):
+        inner = leaf_fields(kind) if _is_structure(kind) else {}
+        found |= {f"{name}.{k}": x for k, x in inner.items()} or {name: kind}
     return found
 
 
@@ -79,7 +156,7 @@ def written(
     """A Warp function of a text, in which S is the structure.
 
     Args:
-        structure: The structure.
+        structure: The structure, or a function that it is made from.
         name: Of the function.
         lines: Of its text.
         names: What else the text refers to.

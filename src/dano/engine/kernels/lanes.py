@@ -14,7 +14,7 @@ import warp as wp
 
 from dano.physics.features import LANES
 from dano.physics.real import INFINITY, mat33, mat66, quat, real, vec3, vec4, vec6
-from dano.physics.structures import plain_fields, written
+from dano.physics.structures import leaf_fields, written
 
 # Beyond all indices.
 _NONE = wp.constant(2**31 - 1)
@@ -102,7 +102,9 @@ def total_of(structure: Any) -> Any:
     """Sum of a structure over the lanes of a world."""
     lines = ["def whole(a: S) -> S:"]
     if LANES > 1:
-        lines += [f"    a.{name} = {_TOTALS[kind]}(a.{name})" for name, kind in plain_fields(structure)]
+        lines += [
+            f"    a.{name} = {_TOTALS[kind]}(a.{name})" for name, kind in leaf_fields(structure).items()
+        ]
     sums = {name: globals()[name] for name in _TOTALS.values()}
     return written(structure, "whole", [*lines, "    return a"], sums)
 

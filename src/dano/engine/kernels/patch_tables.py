@@ -70,3 +70,4 @@ class PatchRoom:
     wrenches: wp.array2d(dtype=vec6)  # In the step, about the first body's centre of mass [N s; N m s, W]
     jacobians: wp.array2d(dtype=mat66)  # Their derivatives by the relative twist there
     sums: wp.array2d(dtype=Sums)  # Over the samples of each side, shape (worlds, sides); only for derivatives
+    sum_bars: wp.array2d(dtype=Sums)  # Derivatives by these

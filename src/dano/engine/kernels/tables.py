@@ -7,9 +7,9 @@ whose fields stand in the order of the row; whole numbers are the same for all w
 import warp as wp
 
 from dano.engine.kernels.patch_tables import PatchRoom, PatchSide, PatchTables
-from dano.engine.kernels.trees.tables import TreeRoom, Trees
+from dano.engine.kernels.trees.tables import Chain, TreeRoom, Trees
 from dano.physics.impacts import Impact, Patch, Rest
-from dano.physics.overlap import Part, WeightedSample
+from dano.physics.overlap import Part, Sums, WeightedSample
 from dano.physics.pairs import BodyState
 from dano.physics.patch_law import PatchMaterial
 from dano.physics.point_law import Duals, Gate, Linear, Material, PointLaw
@@ -190,11 +190,83 @@ class FoundPair:
 
 
 @wp.struct
-class Moment:
-    """When the angular momentum of a body is balanced, see `BodyState`."""
+class Given:
+    """What a step is given of bodies. Warp adds derivatives by it to `Bars` of the same name.
 
-    met: real
-    lead: real
+    Attributes: those of `Scene` and `Launch` with the same names, of one step;
+        seen: `Room.bodies`, with derivatives in `Room.body_bars`.
+    """
+
+    bodies: wp.array2d(dtype=Body)
+    gravity: wp.array2d(dtype=vec3)
+    timestep: wp.array2d(dtype=real)
+    state: wp.array2d(dtype=StateRow)
+    pushes: wp.array2d(dtype=Push)
+    seen: wp.array2d(dtype=BodyState)
+
+
+@wp.struct
+class GivenTrees:
+    """The same of bodies on joints.
+
+    Attributes: those of `Trees` and `Launch` with the same names;
+        chains: `TreeRoom.chains`, with derivatives in `TreeRoom.chain_bars`.
+    """
+
+    joints: wp.array2d(dtype=Joint)
+    laws: wp.array2d(dtype=JointLaw)
+    loops: wp.array2d(dtype=Loop)
+    q: wp.array2d(dtype=real)
+    v: wp.array2d(dtype=real)
+    efforts: wp.array2d(dtype=real)
+    commands: wp.array2d(dtype=real)
+    chains: wp.array2d(dtype=Chain)
+
+
+@wp.struct
+class GivenPatches:
+    """The same of contacts with a patch law.
+
+    Attributes: those of `PatchTables` with the same names, and leaves of solids;
+        sums: `PatchRoom.sums`, with derivatives in `PatchRoom.sum_bars`.
+    """
+
+    patch_materials: wp.array2d(dtype=PatchMaterial)
+    sides: wp.array2d(dtype=PatchSide)
+    leaves: wp.array2d(dtype=Leaf)
+    sums: wp.array2d(dtype=Sums)
+
+
+@wp.struct
+class Bars:
+    """Derivatives by what a step is given.
+
+    Attributes: those of `Given`, `GivenTrees`, `GivenPatches` and `Scene` with the same names; `weighted` are
+    samples of contacts with a patch law, `coefficients` those of `Solids`. These and samples have no columns
+    where nobody asks for them.
+    """
+
+    bodies: wp.array2d(dtype=Body)
+    leaves: wp.array2d(dtype=Leaf)
+    pairs: wp.array2d(dtype=SamplePair)
+    materials: wp.array2d(dtype=Material)
+    gravity: wp.array2d(dtype=vec3)
+    timestep: wp.array2d(dtype=real)
+    joints: wp.array2d(dtype=Joint)
+    laws: wp.array2d(dtype=JointLaw)
+    loops: wp.array2d(dtype=Loop)
+    patch_materials: wp.array2d(dtype=PatchMaterial)
+    sides: wp.array2d(dtype=PatchSide)
+    parts: wp.array2d(dtype=Part)
+    state: wp.array2d(dtype=StateRow)
+    pushes: wp.array2d(dtype=Push)
+    q: wp.array2d(dtype=real)
+    v: wp.array2d(dtype=real)
+    efforts: wp.array2d(dtype=real)
+    commands: wp.array2d(dtype=real)
+    samples: wp.array2d(dtype=Sample)
+    weighted: wp.array2d(dtype=WeightedSample)
+    coefficients: wp.array2d(dtype=real)
 
 
 @wp.struct
@@ -233,19 +305,22 @@ class Room:
         best: Where the residual was smallest.
         moved: By which positions change within a step.
         late: Virtual velocities of impulses that take effect within a step.
-        moment_bar: Derivatives by when the angular momentum of bodies is balanced.
         step: Of Newton's method.
         residual: What each block misses [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
         patches: Contacts with a patch law.
         trees: Room for bodies on joints.
-        state_bar: Derivatives by the states at the start of a step.
-        after_bar: By those at its end.
+        given: What the step is given; only for derivatives.
+        given_trees: …
+        given_patches: …
+        bars: Derivatives by it.
+        body_bars: By `bodies`.
+        after_bar: By the states at the end of a step.
         wrenches: Impulse of each pair that is near, at the first body's centre of mass [N s, N m s, W].
         missing: Changes of the equations of a step, shape (worlds, directions · m).
-        delayed: … and of impulses times the share of the step after which they take effect.
-        moments: … and of when angular momentum is balanced.
-        splines: Changes of an equation by changes of coefficients, shape (worlds, directions · lanes).
+        moving: Changes of what the step is given, one direction after the other.
+        along: What they make of a number, by directions.
+        parts: … by changes of samples and coefficients, the part of each lane, (worlds, directions · lanes).
     """
 
     bodies: wp.array2d(dtype=BodyState)
@@ -278,53 +353,48 @@ class Room:
     best: wp.array2d(dtype=vec6)
     moved: wp.array2d(dtype=vec6)
     late: wp.array2d(dtype=vec6)
-    moment_bar: wp.array2d(dtype=Moment)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)
     patches: PatchRoom
     trees: TreeRoom
-    state_bar: wp.array2d(dtype=StateRow)
+    given: Given
+    given_trees: GivenTrees
+    given_patches: GivenPatches
+    bars: Bars
+    body_bars: wp.array2d(dtype=BodyState)
     after_bar: wp.array2d(dtype=StateRow)
     wrenches: wp.array2d(dtype=vec6)
     missing: wp.array2d(dtype=vec6)
-    delayed: wp.array2d(dtype=vec6)
-    moments: wp.array2d(dtype=Moment)
-    splines: wp.array2d(dtype=real)
+    along: wp.array2d(dtype=real)
+    moving: wp.array2d(dtype=real)
+    parts: wp.array2d(dtype=real)
 
 
 @wp.struct
-class Changes:
-    """Numbers that belong to what a rollout is given and to what it finds: derivatives by them, or changes.
+class Ends:
+    """What derivatives of a rollout are given, and what they give: derivatives, or changes in directions.
 
-    Arrays without columns are not asked for, or do not change. Those of changes hold one direction after the
-    other.
+    All are numbers in the order of a launch, of shape (worlds, …); changes are one direction after the other.
 
-    Attributes: those of `Scene`, `Trees` and `Launch` with the same names; `coefficients` are those of
-    `Solids`, `patch_materials`, `sides`, `weighted` (samples) and `parts` (of fields) those of `PatchTables`.
+    Attributes:
+        given: What is given at the start of the rollout.
+        changes: Its changes.
+        values: What a step is given, as `Room.given` and others show it.
+        bars: Derivatives by it, as `Room.bars` shows them.
+        after: By the state at the end of a step.
+        ends: By those at the ends of all steps, or their changes.
+        controls: By the controls of all steps, or their changes.
+        samples: Changes of samples; no columns where they do not change.
+        weighted: …
     """
 
-    bodies: wp.array2d(dtype=Body)
+    given: wp.array2d(dtype=real)
+    changes: wp.array2d(dtype=real)
+    values: wp.array2d(dtype=real)
+    bars: wp.array2d(dtype=real)
+    after: wp.array2d(dtype=real)
+    ends: wp.array2d(dtype=real)
+    controls: wp.array2d(dtype=real)
     samples: wp.array2d(dtype=Sample)
-    leaves: wp.array2d(dtype=Leaf)
-    coefficients: wp.array2d(dtype=real)
-    pairs: wp.array2d(dtype=SamplePair)
-    materials: wp.array2d(dtype=Material)
-    gravity: wp.array2d(dtype=vec3)
-    timestep: wp.array2d(dtype=real)
-    state: wp.array2d(dtype=StateRow)
-    pushes: wp.array2d(dtype=Push)
-    joints: wp.array2d(dtype=Joint)
-    laws: wp.array2d(dtype=JointLaw)
-    loops: wp.array2d(dtype=Loop)
-    q: wp.array2d(dtype=real)
-    v: wp.array2d(dtype=real)
-    efforts: wp.array2d(dtype=real)
-    commands: wp.array2d(dtype=real)
-    states: wp.array2d(dtype=StateRow)
-    qs: wp.array2d(dtype=real)
-    vs: wp.array2d(dtype=real)
-    patch_materials: wp.array2d(dtype=PatchMaterial)
-    sides: wp.array2d(dtype=PatchSide)
     weighted: wp.array2d(dtype=WeightedSample)
-    parts: wp.array2d(dtype=Part)

@@ -1,6 +1,7 @@
 """Parameters of kernels: structures of arrays that point to the memory that a launch is given."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from dano.engine.launching._plans import OfWidth, Plan
 from dano.native import Array, Layout, Parameters
@@ -25,21 +26,45 @@ def parameters_of(
     for (place, shape), differs in zip([*plan.inputs.items(), *plan.outputs.items()], differ, strict=True):
         row = shape.rows * shape.width * size if differs else 0
         made.point(place, (n_worlds, shape.rows), (row, shape.width * size))
+    for place, view in plan.views.items():
+        row = plan.outputs[view.output].rows * size
+        made.point(place, (n_worlds, view.shape.rows), (row, view.shape.width * size))
     return made
 
 
-def given_arrays(plan: Plan, parameters: Parameters) -> tuple[list[Array], list[tuple[Array, int]]]:
-    """What a launch has to point to its memory, in the order of inputs and outputs.
+class Pointed(NamedTuple):
+    """An array that points into an input or an output."""
 
-    Returns:
-        Arrays, and those whose derivatives are also to be found, with the number of the output that these
-        are.
+    array: Array
+    number: int  # Of the input or output, counted through
+    at: int  # How far into it [bytes]
+    is_gradient: bool  # Whether it is where Warp adds derivatives by the array
+
+    def point(self, pointers: Sequence[int]) -> None:
+        """Point it to its memory, from the addresses of inputs and outputs."""
+        address = pointers[self.number] + self.at
+        if self.is_gradient:
+            self.array.grad = address
+        else:
+            self.array.data = address
+
+
+def given_arrays(plan: Plan, parameters: Parameters, *, wide: bool = True) -> list[Pointed]:
+    """What a launch has to point to its memory.
+
+    Args:
+        plan: The plan.
+        parameters: Of the launch.
+        wide: Whether numbers have 64 bits.
     """
     places = [*plan.inputs, *plan.outputs]
-    arrays = [parameters.array(place) for place in places]
-    gradients = [
-        (arrays[places.index(place)], places.index(output))
-        for place, output in plan.gradients.items()
-        if output in places
-    ]
-    return arrays, gradients
+    found = [Pointed(parameters.array(place), k, 0, False) for k, place in enumerate(places)]
+    for place, output in plan.gradients.items():
+        if output in places and place in places:
+            found.append(Pointed(parameters.array(place), places.index(output), 0, True))
+    for place, view in plan.views.items():
+        array, at = parameters.array(place), view.at * (8 if wide else 4)
+        found.append(Pointed(array, places.index(view.output), at, False))
+        if view.gradient:
+            found.append(Pointed(array, places.index(view.gradient), at, True))
+    return found

@@ -78,10 +78,8 @@ class _Launcher:
             for pointer, shape in zip(outputs, self.plan.outputs.values(), strict=True):
                 ctypes.memset(pointer, 0, 8 * self.n_worlds * shape.rows * shape.width)
         for share in shares:
-            for array, pointer in zip(share.arrays, pointers, strict=True):
-                array.data = pointer
-            for array, k in share.gradients:
-                array.grad = pointers[k]
+            for pointed in share.arrays:
+                pointed.point(pointers)
         if len(shares) == 1:
             shares[0].launch()
         else:
@@ -141,6 +139,10 @@ class _Share:
             # One world after the other works in the same room.
             item = kernel.layout.arrays[place].item
             parameters.point(place, (n_worlds, plan.room[place]), (0, item), start + begin)
+        for place, (of, bars) in plan.views_of_room.items():
+            given = parameters.array(of)
+            parameters.point(place, tuple(given.shape[:2]), tuple(given.strides[:2]), given.data)
+            parameters.array(place).grad = parameters.array(bars).data
         self._kept = memory, plan
         self.launch = Launch(kernel, parameters, count)
-        self.arrays, self.gradients = given_arrays(plan, parameters)
+        self.arrays = given_arrays(plan, parameters)

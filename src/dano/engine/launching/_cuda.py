@@ -24,7 +24,7 @@ LANES = 32
 PLATFORM = "CUDA"
 # Arrays in the room that have a part for each lane, of the length that one lane needs; and lists of points,
 # of which each lane has a part that is that much longer than its share: lanes do not find equally many.
-_OF_EACH_LANE = ("room.found",)
+_OF_EACH_LANE = ("room.found", "room.parts")
 _OF_POINTS = tuple(
     f"room.{name}"
     for name in ("near", "until", "where", "points", "laws", "gates", "marks", "duals", "changes", "linear")
@@ -152,9 +152,15 @@ class _Blocks:
         places, size = _layout(plan, build)
         for place, (_, length, item) in places.items():
             parameters.point(place, (n_worlds, length), (size, item))
-        self._arrays, self._gradients = given_arrays(plan, parameters)
+        self._arrays = given_arrays(plan, parameters, wide=build.wide)
         self._whole = [parameters.array(place) for place in plan.whole]
         self._room = [(parameters.array(place), at) for place, (at, _, _) in places.items()]
+        self._gradients = []
+        for place, (of, bars) in plan.views_of_room.items():
+            at, length, item = places[of]
+            parameters.point(place, (n_worlds, length), (size, item))
+            self._room.append((parameters.array(place), at))
+            self._gradients.append((parameters.array(place), places[bars][0]))
         self._command = _recorded(plan.in_lanes(build), (n_worlds, build.lanes), device)
         self.room_bytes = n_worlds * size
         self._n_inputs = len(plan.inputs)
@@ -163,14 +169,14 @@ class _Blocks:
         """Launch on a stream."""
         *outputs, room = outputs
         pointers = [*inputs[: self._n_inputs], *outputs]
-        for array, pointer in zip(self._arrays, pointers, strict=True):
-            array.data = pointer
-        for array, k in self._gradients:
-            array.grad = pointers[k]
+        for pointed in self._arrays:
+            pointed.point(pointers)
         for array, pointer in zip(self._whole, inputs[self._n_inputs :], strict=False):
             array.data = pointer
         for array, at in self._room:
             array.data = room + at
+        for array, at in self._gradients:
+            array.grad = room + at
         for given, (at, bytes_) in zip(
             self._command.params[1:], self._parameters.layout.arguments.values(), strict=True
         ):

@@ -8,41 +8,50 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from dano.engine.launching._launch import launch_p, merged, Plan, plan, Shape
+from dano.engine.launching._launch import launch_p, merged, Plan, plan, Shape, View
 
-CHANGING = {
-    "scene.bodies": "bodies",
-    "scene.samples": "samples",
-    "scene.solids.leaves": "leaves",
-    "scene.solids.coefficients": "coefficients",
-    "scene.pairs": "pairs",
-    "scene.materials": "materials",
-    "scene.gravity": "gravity",
-    "scene.timestep": "timestep",
-    "launch.state": "state",
-    "launch.pushes": "pushes",
-    "scene.trees.joints": "joints",
-    "scene.trees.laws": "laws",
-    "scene.trees.loops": "loops",
-    "launch.q": "q",
-    "launch.v": "v",
-    "launch.efforts": "efforts",
-    "launch.commands": "commands",
-    "scene.patches.materials": "patch_materials",
-    "scene.patches.sides": "sides",
-    "scene.patches.samples": "weighted",
-    "scene.patches.fields.parts": "parts",
+_STATE = {"state": "launch.state", "q": "launch.q", "v": "launch.v"}
+_CONTROLS = {"pushes": "launch.pushes", "efforts": "launch.efforts", "commands": "launch.commands"}
+"""What a step is given that others are not: the first numbers in the order of a launch, see `_numbers`."""
+_SCENE = {
+    "bodies": "scene.bodies",
+    "leaves": "scene.solids.leaves",
+    "pairs": "scene.pairs",
+    "materials": "scene.materials",
+    "gravity": "scene.gravity",
+    "timestep": "scene.timestep",
+    "joints": "scene.trees.joints",
+    "laws": "scene.trees.laws",
+    "loops": "scene.trees.loops",
+    "patch_materials": "scene.patches.materials",
+    "sides": "scene.patches.sides",
+    "parts": "scene.patches.fields.parts",
 }
-"""Inputs by which derivatives are taken, and their names in `dano.engine.kernels.tables.Changes`."""
-
+"""What is the same for all steps: the other numbers."""
+_READ = {
+    "given": ("bodies", "gravity", "timestep", "state", "pushes"),
+    "given_trees": ("joints", "laws", "loops", "q", "v", "efforts", "commands"),
+    "given_patches": ("patch_materials", "sides", "leaves"),
+}
+"""What kernels read of these, by parts of their room; derivatives by all are in `tables.Bars`."""
 _COEFFICIENTS = "scene.solids.coefficients"
+_MANY = {
+    "scene.samples": ("room.bars.samples", "ends.samples"),
+    "scene.patches.samples": ("room.bars.weighted", "ends.weighted"),
+    _COEFFICIENTS: ("room.bars.coefficients", "scene.solids.changes"),
+}
+"""What is too much for each step to look at: where derivatives by it are, and where its changes."""
 
-CHANGED = {"launch.states": "states", "launch.qs": "qs", "launch.vs": "vs"}
-"""Outputs that change, and their names there."""
+CHANGING = frozenset({*_STATE.values(), *_CONTROLS.values(), *_SCENE.values(), *_MANY})
+"""Inputs by which derivatives are taken."""
+
+CHANGED = ("launch.states", "launch.qs", "launch.vs")
+"""Outputs that change."""
 
 tangent_p = Primitive("dano_rollout_tangent")
 tangent_p.multiple_results = True
@@ -124,37 +133,134 @@ def _places(plan: Plan) -> dict[str, Shape]:
     return {**plan.inputs, **plan.outputs}
 
 
+def _numbers(forward: Plan) -> dict[str, tuple[str, int, Shape]]:
+    """Fields in the order of a launch: which input each is, where it begins, and its shape in a step."""
+    n = forward.inputs["launch.state"].rows
+    k = forward.inputs["launch.q"].rows if "launch.q" in forward.inputs else 0
+    of_bodies = {"state": Shape(n, 13), "pushes": Shape(n, 6)}
+    of_step = {**_STATE, **_CONTROLS}
+    shapes = {name: (place, of_bodies.get(name, Shape(k, 1))) for name, place in of_step.items()}
+    scene = {name: place for name, place in _SCENE.items() if place in forward.inputs}
+    shapes |= {name: (place, forward.inputs[place]) for name, place in scene.items()}
+    found, at = {}, 0
+    for name, (place, shape) in shapes.items():
+        found[name] = place, at, shape
+        at += shape.rows * shape.width
+    return found
+
+
+def _length(numbers: dict[str, tuple[str, int, Shape]], names: Any) -> int:
+    """How many numbers some fields have."""
+    return sum(numbers[name][2].rows * numbers[name][2].width for name in names)
+
+
+def _joined(parts: dict[str, Any], shapes: dict[str, Shape], lead: tuple[int, ...], dtype: Any) -> Any:
+    """Arrays by name as one row of numbers, after axes that all have or that they are spread over.
+
+    Args:
+        parts: The arrays; zero where there is none.
+        shapes: Of one row, in the order of the numbers.
+        lead: Sizes of the axes before.
+        dtype: Of the numbers.
+    """
+    rows = []
+    for name, shape in shapes.items():
+        size = shape.rows * shape.width
+        part = parts.get(name, np.zeros((1,) * len(lead) + (size,), dtype))
+        rows.append(jnp.broadcast_to(part.reshape(*part.shape[: len(lead)], size), (*lead, size)))
+    return jnp.concatenate(rows, axis=-1)
+
+
+def _given(forward: Plan, rows: dict[str, Any], lead: tuple[int, ...], dtype: Any) -> Any:
+    """What is given at the start of a rollout, or changes of it, in the order of a launch."""
+    numbers = _numbers(forward)
+    parts = {
+        name: rows[place]
+        for name, (place, _, _) in numbers.items()
+        if place in rows and name not in _CONTROLS
+    }
+    return _joined(parts, {name: shape for name, (_, _, shape) in numbers.items()}, lead, dtype)
+
+
+def _by_steps(forward: Plan, fields: dict[str, str], rows: dict[str, Any], lead: tuple[int, ...], dtype: Any):
+    """Arrays of all steps by place, (…, steps · rows, width), as numbers: step by step, field by field."""
+    numbers, steps = _numbers(forward), forward.numbers["launch.n_steps"]
+    parts = {
+        name: rows[place].reshape(*rows[place].shape[: len(lead)], steps, -1)
+        for name, place in fields.items() if place in rows and rows[place].size
+    }  # fmt: skip
+    joined = _joined(parts, {name: numbers[name][2] for name in fields}, (*lead, steps), dtype)
+    return joined.reshape(*lead, -1)
+
+
+def _of_steps(forward: Plan, fields: dict[str, str], row: Any, lead: tuple[int, ...]) -> dict[str, Any]:
+    """The other way round: arrays by place from numbers."""
+    numbers, steps = _numbers(forward), forward.numbers["launch.n_steps"]
+    row = row.reshape(*lead, steps, -1)
+    ends = np.cumsum([_length(numbers, [name]) for name in fields])[:-1]
+    parts = zip(fields.items(), jnp.split(row, ends, axis=-1), strict=True)
+    return {
+        place: part.reshape(*lead, steps * numbers[name][2].rows, numbers[name][2].width)
+        for (name, place), part in parts
+    }
+
+
+_ENDS = dict(zip(_STATE, CHANGED, strict=True))
+
+
+def _working(forward: Plan) -> tuple[dict[str, Shape], dict[str, View]]:
+    """Outputs that kernels of derivatives work in, and views of them."""
+    numbers = _numbers(forward)
+    row, end = Shape(_length(numbers, numbers), 1), Shape(_length(numbers, _STATE), 1)
+    views = {
+        f"room.{part}.{name}": View("ends.values", *numbers[name][1:], "ends.bars")
+        for part, names in _READ.items() for name in names if name in numbers
+    }  # fmt: skip
+    views |= {f"room.bars.{name}": View("ends.bars", at, shape) for name, (_, at, shape) in numbers.items()}
+    after = {"state": "room.after_bar", "q": "room.trees.q_after", "v": "room.trees.v_after"}
+    views |= {
+        place: View("ends.after", *numbers[name][1:])
+        for name, place in after.items() if numbers[name][2].rows
+    }  # fmt: skip
+    return {"ends.values": row, "ends.bars": row, "ends.after": end}, views
+
+
 def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
-    names = list(forward.inputs)
-    wanted = [names[i] for i in which]
-    asked = {f"bars.{CHANGED[name]}": shape for name, shape in _changed(forward).items()}
-    inputs = {**_places(forward), **asked}
-    outputs = {f"bars.{CHANGING[name]}": forward.inputs[name] for name in wanted}
+    wanted = [list(forward.inputs)[i] for i in which]
+    numbers, steps = _numbers(forward), forward.numbers["launch.n_steps"]
+    outputs, views = _working(forward)
+    outputs |= {"ends.controls": Shape(steps * _length(numbers, _CONTROLS), 1)}
+    inputs = {"ends.ends": Shape(steps * _length(numbers, _STATE), 1), "ends.given": outputs["ends.values"]}
     return plan(
         "dano.engine.kernels.derivatives.pullback",
         "pullback",
         forward.features.but(ADJOINTS=True),
-        inputs,
-        outputs,
+        {**_places(forward), **inputs},
+        {**outputs, **{_MANY[name][0]: forward.inputs[name] for name in wanted if name in _MANY}},
         forward.whole,
         {**forward.room, **_pulling_room(forward)},
         forward.numbers,
+        views,
     )
 
 
 def _pulling_room(forward: Plan) -> dict[str, int]:
     """Lengths of what a world needs besides for derivatives of a step's equations."""
     n = forward.room["room.bodies"]
-    room: dict[str, int] = {"room.state_bar": n, "room.after_bar": n}
-    room |= {f"room.{name}": forward.room["room.velocity"] for name in ("late", "moment_bar")}
+    room: dict[str, int] = {"room.body_bars": n, "room.late": forward.room["room.velocity"]}
     if "scene.patches.sides" in forward.inputs:
-        room |= {"room.patches.sums": forward.inputs["scene.patches.sides"].rows}
+        sides = forward.inputs["scene.patches.sides"].rows
+        room |= {"room.patches.sums": sides, "room.patches.sum_bars": sides}
     if "room.trees.joints" in forward.room:
         names = ("chains", "chain_bars", "hanging_bars", "asked")
         room |= {f"room.trees.{name}": forward.room["room.trees.frames"] for name in names}
-        names = ("q_bar", "v_bar", "q_after", "v_after")
-        room |= {f"room.trees.{name}": forward.room["room.trees.joints"] for name in names}
     return room
+
+
+def _rows(plan: Plan, inputs: Any, batched: Any) -> dict[str, Any]:
+    """Inputs of a rollout by place, with an axis of worlds, of which there is one where all are alike."""
+    rows = zip(plan.inputs, inputs, batched, strict=False)
+    return {place: x if differs else x[None] for place, x, differs in rows}
 
 
 def _transposed(cotangents, *inputs, plan, batched, n_worlds, which, differs, n_directions):
@@ -172,9 +278,27 @@ def _transposed(cotangents, *inputs, plan, batched, n_worlds, which, differs, n_
             residuals[at] = jnp.broadcast_to(residuals[at][None], (n_worlds, *residuals[at].shape))
             batched[at] = True
 
+    dtype = residuals[0].dtype
+    given = _given(plan, _rows(plan, residuals, batched), (n_worlds,), dtype)
+    numbers = {place: (at, shape) for place, at, shape in _numbers(plan).values()}
+
     def pull(bars):
-        given = (*batched, *(True for _ in bars))
-        return launch_p.bind(*residuals, *bars, plan=back, batched=given, n_worlds=n_worlds)
+        asked = _by_steps(plan, _ENDS, dict(zip(_changed(plan), bars, strict=True)), (n_worlds,), dtype)
+        rows = [*residuals, asked[..., None], given[..., None]]
+        rows = launch_p.bind(*rows, plan=back, batched=(*batched, True, True), n_worlds=n_worlds)
+        found = dict(zip(back.outputs, rows, strict=True))
+        controls = _of_steps(plan, _CONTROLS, found["ends.controls"], (n_worlds,))
+        by = []
+        for name in (list(plan.inputs)[i] for i in which):
+            if name in _MANY:
+                by.append(found[_MANY[name][0]])
+            elif name in controls:
+                by.append(controls[name])
+            else:
+                at, shape = numbers[name]
+                part = found["ends.bars"][:, at : at + shape.rows * shape.width]
+                by.append(part.reshape(n_worlds, *shape))
+        return by
 
     if n_directions == 1:
         found = [x[:, None] for x in pull([x[:, 0] for x in bars])]
@@ -231,59 +355,58 @@ def _spread(change, axis, size: int):
     return jnp.broadcast_to(change[:, None], (change.shape[0], size, *change.shape[1:]))
 
 
+def _rows(plan: Plan, inputs: Any, batched: Any) -> dict[str, Any]:
+    """Inputs of a rollout by place, with an axis of worlds, of which there is one where all are alike."""
+    rows = zip(plan.inputs, inputs, batched, strict=False)
+    return {place: x if differs else x[None] for place, x, differs in rows}
+
+
 def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) -> Plan:
-    names = list(forward.inputs)
-    chosen = {names[i]: forward.inputs[names[i]] for i in which}
-    changes = {_place_of_change(k): Shape(n_directions * x.rows, x.width) for k, x in chosen.items()}
-    ends = {
-        f"changes.{CHANGED[name]}": Shape(n_directions * shape.rows, shape.width)
-        for name, shape in _changed(forward).items()
-    }
+    wanted = [list(forward.inputs)[i] for i in which]
+    many = {name: forward.inputs[name] for name in wanted if name in _MANY}
+    numbers, steps = _numbers(forward), n_directions * forward.numbers["launch.n_steps"]
+    outputs, views = _working(forward)
+    row = outputs["ends.values"].rows
+    inputs = {"ends.given": Shape(row, 1), "ends.changes": Shape(n_directions * row, 1)}
+    inputs |= {"ends.controls": Shape(steps * _length(numbers, _CONTROLS), 1)}
+    inputs |= {_MANY[name][1]: Shape(n_directions * x.rows, x.width) for name, x in many.items()}
+    room = {_MANY[name][0]: x.rows for name, x in many.items() if name != _COEFFICIENTS}
+    room |= {"room.parts": n_directions, "room.along": n_directions, "room.moving": n_directions * row}
+    room["room.missing"] = n_directions * forward.room["room.velocity"]
     return plan(
         "dano.engine.kernels.derivatives.pushforward",
         "pushforward",
         forward.features.but(ADJOINTS=True),
-        {**_places(forward), **changes},
-        ends,
+        {**_places(forward), **inputs},
+        {"ends.ends": Shape(steps * _length(numbers, _STATE), 1), **outputs},
         forward.whole,
-        {**forward.room, **_pushforward_room(forward, which, n_directions)},
+        {**forward.room, **_pulling_room(forward), **room},
         {**forward.numbers, "launch.n_directions": n_directions},
+        views,
     )
-
-
-def _place_of_change(place: str) -> str:
-    """Where changes of an input stand; those of coefficients are read as coefficients."""
-    return "scene.solids.changes" if place == _COEFFICIENTS else f"changes.{CHANGING[place]}"
-
-
-def _pushforward_room(forward: Plan, which: tuple[int, ...], n_directions: int) -> dict[str, int]:
-    names = [list(forward.inputs)[i] for i in which]
-    rows = {f"bars.{CHANGING[k]}": forward.inputs[k].rows for k in names if k != _COEFFICIENTS}
-    splines = {"room.splines": n_directions} if _COEFFICIENTS in names else {}
-    return {
-        **_pulling_room(forward),
-        **rows,
-        **splines,
-        **{
-            f"room.{n}": n_directions * forward.room["room.velocity"]
-            for n in ("missing", "delayed", "moments")
-        },
-        "room.wrenches": forward.room["room.found"],
-    }
 
 
 def _lowered(*inputs, plan, batched, n_worlds, which, differs, n_directions):
     n = len(plan.inputs) + len(plan.outputs)
-    forward = _pushforward_plan(plan, which, n_directions)
-    changes = [
-        x.reshape(x.shape[0], -1, x.shape[-1])[slice(None) if d else 0]
-        for x, d in zip(inputs[n:], differs, strict=True)
+    names = [list(plan.inputs)[i] for i in which]
+    changes, dtype = dict(zip(names, inputs[n:], strict=True)), inputs[0].dtype
+    lead = n_worlds, n_directions
+    rows = [
+        _given(plan, _rows(plan, inputs, batched), (n_worlds,), dtype),
+        _given(plan, changes, lead, dtype),
+        _by_steps(plan, _CONTROLS, changes, lead, dtype),
     ]
+    many = [
+        (x.reshape(x.shape[0], -1, x.shape[-1])[slice(None) if d else 0], d)
+        for (name, x), d in zip(changes.items(), differs, strict=True) if name in _MANY
+    ]  # fmt: skip
     found = launch_p.bind(
-        *inputs[:n], *changes, plan=forward, batched=(*batched, *differs), n_worlds=n_worlds
-    )
-    shapes = _changed(plan).values()
-    return [x.reshape(n_worlds, n_directions, *shape) for x, shape in zip(found, shapes, strict=True)]
+        *inputs[:n], *(x.reshape(n_worlds, -1, 1) for x in rows), *(x for x, _ in many),
+        plan=_pushforward_plan(plan, which, n_directions),
+        batched=(*batched, True, True, True, *(d for _, d in many)), n_worlds=n_worlds,
+    )  # fmt: skip
+    moved = _of_steps(plan, _ENDS, found[0], lead)
+    return [moved[name] for name in _changed(plan)]
 
 
 mlir.register_lowering(tangent_p, mlir.lower_fun(_lowered, multiple_results=True))

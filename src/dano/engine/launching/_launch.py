@@ -17,7 +17,13 @@ from jax.interpreters import batching, mlir
 
 from dano.engine._compiling import are_on_cpus, by_numpy_on_cpus
 from dano.engine.launching import _cpu, _cuda
-from dano.engine.launching._plans import OfWidth as OfWidth, Plan as Plan, plan as plan, Shape as Shape
+from dano.engine.launching._plans import (
+    OfWidth as OfWidth,
+    Plan as Plan,
+    plan as plan,
+    Shape as Shape,
+    View as View,
+)
 
 launch_p = Primitive("dano_launch")
 launch_p.multiple_results = True

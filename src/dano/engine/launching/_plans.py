@@ -30,6 +30,15 @@ class OfWidth(NamedTuple):
     narrow: float
 
 
+class View(NamedTuple):
+    """A part of the rows of an output as an array of its own."""
+
+    output: str  # Place of the output, of rows of one number
+    at: int  # Which number it begins with
+    shape: Shape
+    gradient: str = ""  # Place of an output with the derivatives by it, at the same numbers; empty for none
+
+
 class Plan:
     """A launch but for its real numbers.
 
@@ -42,6 +51,7 @@ class Plan:
         whole: Arrays of whole numbers, the same for all worlds, by place.
         room: Lengths of the arrays that a world of one lane works in, by place.
         numbers: Other fields of the parameters, by place, some of them `OfWidth`.
+        views: Arrays that are parts of outputs, by place.
     """
 
     def __init__(
@@ -54,10 +64,12 @@ class Plan:
         whole: dict[str, np.ndarray],
         room: dict[str, int],
         numbers: dict[str, Any],
+        views: dict[str, View],
     ):
         """See the class."""
         self.module, self.kernel, self.features = module, kernel, features
         self.inputs, self.outputs, self.whole, self.room, self.numbers = inputs, outputs, whole, room, numbers
+        self.views = views
         self._compiled: set[tuple[Build, str]] = set()
         self._layouts: dict[Build, Layout] = {}
 
@@ -67,7 +79,8 @@ class Plan:
         Args:
             *more: What else tells them from others.
         """
-        told = [self.module, self.features.values, self.inputs, self.outputs, self.room, self.numbers, *more]
+        told = [self.module, self.features.values, self.inputs, self.outputs, self.room, self.numbers]
+        told += [self.views, *more]
         whole = {name: (values.shape, values.tobytes()) for name, values in self.whole.items()}
         digest = hashlib.sha256(repr((told, whole)).encode()).hexdigest()[:24]
         return f"dano_{self.kernel}_{digest}"
@@ -75,7 +88,12 @@ class Plan:
     @property
     def gradients(self) -> dict[str, str]:
         """Inputs to whose derivatives Warp itself adds, and the outputs that these are."""
-        return {"scene.solids.coefficients": "bars.coefficients"} if self.adds else {}
+        return {"scene.solids.coefficients": "room.bars.coefficients"} if self.adds else {}
+
+    @property
+    def views_of_room(self) -> dict[str, tuple[str, str]]:
+        """Arrays that are others in the room, by place, and where there Warp adds derivatives by them."""
+        return {place: (of, bars) for place, (of, bars) in _OF_ROOM.items() if {of, bars} <= self.room.keys()}
 
     @property
     def adds(self) -> bool:
@@ -107,6 +125,12 @@ class Plan:
             self._compiled.add(key)
 
 
+_OF_ROOM = {
+    "room.given.seen": ("room.bodies", "room.body_bars"),
+    "room.given_trees.chains": ("room.trees.chains", "room.trees.chain_bars"),
+    "room.given_patches.sums": ("room.patches.sums", "room.patches.sum_bars"),
+}
+
 _plans: dict[Any, Plan] = {}
 _lock = threading.Lock()
 
@@ -120,6 +144,7 @@ def plan(
     whole: dict[str, np.ndarray],
     room: dict[str, int],
     numbers: dict[str, Any],
+    views: dict[str, View] | None = None,
 ) -> Plan:
     """A plan; equal ones are the same object, so that compiled programs are found again."""
     key = (
@@ -131,8 +156,9 @@ def plan(
         tuple((name, x.shape, x.tobytes()) for name, x in whole.items()),
         tuple(room.items()),
         tuple(numbers.items()),
+        tuple((views or {}).items()),
     )
     with _lock:
         if key not in _plans:
-            _plans[key] = Plan(module, kernel, features, inputs, outputs, whole, room, numbers)
+            _plans[key] = Plan(module, kernel, features, inputs, outputs, whole, room, numbers, views or {})
         return _plans[key]

@@ -4,20 +4,24 @@ At the root of R(V; θ) = 0 the implicit function theorem gives θ̄ = −(∂R/
 with λ as *virtual velocities* of the bodies, −λ · R is the work of impulses along them: a sum over bodies
 and points. Each term is one of the functions below, made of the formulas of the step itself, and
 `wp.grad` differentiates it.
-"""
 
-from types import CodeType
-from typing import Any
+What a function reads of an array whose `grad` points somewhere, Warp adds the derivative to by itself: by
+`Room.given` to `Room.bars`, by `Room.bodies` to `Room.body_bars`. That is for what few lanes do; what many
+samples depend on is a structure by value, whose derivatives are summed before they are added.
+"""
 
 import warp as wp
 
-from dano.engine.kernels.tables import Body, Moment, Push, StateRow
+from dano.engine.kernels.impacts import support_before, support_delayed
+from dano.engine.kernels.tables import Body, FoundPair, Given, StateRow
 from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
 from dano.physics.impacts import (
+    delayed,
     depth_beside,
     fall_of,
     Impact,
+    no_impact,
     Patch,
     patch_of_sample,
     Rest,
@@ -47,8 +51,13 @@ from dano.physics.rotations import from_wxyz, interpolated, matrix, to_wxyz, tur
 from dano.physics.samples import point_contact, position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.leaves import Distance, Solids
-from dano.physics.structures import product_of
+from dano.physics.structures import need_adjoints, product_of, vjp_of
 from dano.physics.twists import angular_part, joined, linear_part, relative_twist, wrench_at
+
+PRESSES, MEETS, RESTS = 0, 1, 2
+"""What is asked of samples: the work of those that press; the patch of an impact; what a pair rests on."""
+
+_PRESSES, _MEETS = wp.constant(PRESSES), wp.constant(MEETS)
 
 
 @wp.struct
@@ -67,93 +76,111 @@ class Virtual:
     second_late: vec6
 
 
+@wp.struct
+class MetPair:
+    """The bodies of a pair, and when and how they meet."""
+
+    first: BodyState  # The sampled body
+    second: BodyState  # The other
+    scale: vec3  # Semi-axes of the first [m]
+    share: real  # τ
+    timestep: real  # h [s]
+    toward: vec3  # Direction that samples which turn face [F]
+
+
+@wp.struct
+class Touching:
+    """What the samples of a pair depend on besides themselves and solids."""
+
+    pose: PairPose  # Where geometry is taken
+    share: real  # τ
+    timestep: real  # h [s]
+    stiffness_share: real  # Share of the contact's stiffness that the pair carries [1]
+    depth: real  # δ [m]
+    fall: real  # See `fall_of` [m]
+    rests: real  # See `share_left_out`
+    material: Material  # With the share of the restitution that counts
+    impact: Impact
+
+
+@wp.struct
+class Asked:
+    """By what samples give: derivatives."""
+
+    patch: Patch
+    rest: Rest
+
+
+patch_product, rest_product = product_of(Patch), product_of(Rest)
+impact_product, body_product = product_of(Impact), product_of(BodyState)
+distance_work = vjp_of(leaf_distance)
+
+
 @wp.func
-def point_work(
-    pose: PairPose,
+def sample_work(
+    what: int,
+    at: Touching,
+    twists: Virtual,
     sample: Sample,
     d: Distance,
     turning: int,
     presses_back: bool,
-    stiffness_share: real,
-    share: real,
-    h: real,
-    material: Material,
-    rebound: real,
-    impact: Impact,
-    twists: Virtual,
-    at: Slip,
+    slip: Slip,
+    asked: Asked,
 ) -> real:
-    """Work of a point's impulse along the virtual velocities of its bodies."""
-    point = point_contact(pose, sample, d, turning, presses_back, stiffness_share, share * h)
-    if material.instant > ZERO:
-        material.restitution = rebound * material.restitution
-    law = point_law(material, point, impact)
-    twist = relative_twist(twists.first, twists.second, pose.com_difference)
-    virtual = relative_twist(twists.first_virtual, twists.second_virtual, pose.com_difference)
-    late = relative_twist(twists.first_late, twists.second_late, pose.com_difference)
-    along = virtual.velocity - (impact.delays * share) * late.velocity
-    turn = virtual.spin - (impact.delays * share) * late.spin
-    motion = point_motion(point, twist.velocity, twist.spin)
-    found = traction(law, motion.rate, motion.slip + law.extra_slip)
-    if at.is_gradual:
-        bound = friction_bound(law, found.pressure)
-        found.friction = friction_near(motion.slip + law.extra_slip, bound.value, at)
-    by_pressure = wp.dot(point.normal, along) + wp.dot(point.moment, turn)
-    by_friction = wp.dot(found.friction, along + wp.cross(turn, point.arm))
-    return h * point.area * (found.pressure * by_pressure + by_friction)
+    """Work of a point's impulse along the virtual velocities of its bodies; or ⟨bars, what a sample adds⟩."""
+    h = at.timestep
+    if what == _PRESSES:
+        point = point_contact(at.pose, sample, d, turning, presses_back, at.stiffness_share, at.share * h)
+        law = point_law(at.material, point, at.impact)
+        apart = at.pose.com_difference
+        twist = relative_twist(twists.first, twists.second, apart)
+        virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
+        late = relative_twist(twists.first_late, twists.second_late, apart)
+        along = virtual.velocity - (at.impact.delays * at.share) * late.velocity
+        turn = virtual.spin - (at.impact.delays * at.share) * late.spin
+        motion = point_motion(point, twist.velocity, twist.spin)
+        found = traction(law, motion.rate, motion.slip + law.extra_slip)
+        if slip.is_gradual:
+            bound = friction_bound(law, found.pressure)
+            found.friction = friction_near(motion.slip + law.extra_slip, bound.value, slip)
+        by_pressure = wp.dot(point.normal, along) + wp.dot(point.moment, turn)
+        by_friction = wp.dot(found.friction, along + wp.cross(turn, point.arm))
+        return h * point.area * (found.pressure * by_pressure + by_friction)
+    bounce = at.material.bounce
+    if what == _MEETS:
+        met = point_contact(at.pose, sample, d, turning, False, at.stiffness_share, at.share * h)
+        of_patch = patch_of_sample(
+            met.area, met.sunk, at.depth, met.approach, bounce, at.rests, met.arm, met.normal
+        )
+        return patch_product(asked.patch, of_patch)
+    still = point_contact(at.pose, sample, d, turning, False, ONE, ZERO)
+    of_rest = rest_of_sample(still.depth, at.fall, still.approach, bounce, still.arm, still.normal)
+    return rest_product(asked.rest, of_rest)
 
 
 @wp.func
-def distance_work(solids: Solids, world: int, solid: Solid, x: vec3, bar: Distance) -> real:
-    """⟨bar, distance and gradient of a leaf at x⟩."""
-    d = leaf_distance(solids, world, solid.kind, solid.leaf, x)
-    return bar.value * d.value + wp.dot(bar.gradient, d.gradient)
+def pose_of(at: MetPair, turning: int, follows: real) -> PairPose:
+    """Pose of a pair when geometry is taken."""
+    return pair_pose(at.first, at.second, at.share, at.timestep, at.toward, turning, at.scale, follows)
+
+
+pose_work = vjp_of(pose_of)
 
 
 @wp.func
-def sample_distance(
-    solids: Solids,
-    world: int,
-    solid: Solid,
-    first: BodyState,
-    second: BodyState,
-    share: real,
-    h: real,
-    toward: vec3,
-    turning: int,
-    scale: vec3,
-    sample: vec3,
-) -> real:
-    """Distance of a sample from a leaf after a share of the step: −sink at the moment when bodies meet."""
-    pose = pair_pose(first, second, share, h, toward, turning, scale, ZERO)
-    return leaf_distance(solids, world, solid.kind, solid.leaf, position_in_solid(pose, sample)).value
+def apart_of(at: MetPair, first_until: real, second_until: real) -> vec3:
+    """Way between the centres of mass, where impulses take effect after shares of the step [m, W]."""
+    return centres_apart(at.first, at.second, first_until, second_until, at.timestep)
 
 
-pose_product = product_of(PairPose)
+apart_work = vjp_of(apart_of)
 
 
 @wp.func
-def pair_work(
-    first: BodyState,
-    second: BodyState,
-    share: real,
-    h: real,
-    toward: vec3,
-    turning: int,
-    scale: vec3,
-    follows: real,
-    bar: PairPose,
-) -> real:
-    """⟨bar, pose of a pair⟩."""
-    return pose_product(bar, pair_pose(first, second, share, h, toward, turning, scale, follows))
-
-
-@wp.func
-def apart_work(
-    first: BodyState, second: BodyState, first_until: real, second_until: real, h: real, bar: vec3
-) -> real:
-    """⟨bar, way between the centres of mass of a pair when impulses take effect⟩."""
-    return wp.dot(bar, centres_apart(first, second, first_until, second_until, h))
+def critical_work(at: MetPair, turning: int, sample: vec3, gradient: vec3) -> real:
+    """Distance of a sample from a solid when geometry is taken, as it changes with where the sample is."""
+    return wp.dot(gradient, position_in_solid(pose_of(at, turning, ZERO), sample))
 
 
 @wp.func
@@ -161,27 +188,30 @@ def facing_work(
     solids: Solids,
     world: int,
     solid: Solid,
-    first: BodyState,
-    second: BodyState,
-    share: real,
-    h: real,
+    at: MetPair,
     turning: int,
-    scale: vec3,
     point: vec3,
-    toward_bar: vec3,
-    touched_bar: vec3,
+    by_toward: vec3,
+    bar: vec3,
 ) -> real:
     """⟨bars, direction that samples face, and where one step of the search for it leads from a point⟩."""
-    inverse = wp.transpose(rotation_after(second, share))
-    turn = inverse * rotation_after(first, share)
-    com = inverse * (position_after(first, share, h) - position_after(second, share, h)) + second.com
-    origin = com - turn * first.com
+    origin, turn = origin_in_solid(at)
     if turning == 1:
-        return wp.dot(toward_bar, seen_from(solids, world, solid, turn, origin).gradient)
-    found = closer(solids, world, solid, turn, origin, scale, point)
-    least = wp.min(scale[0], wp.min(scale[1], scale[2]))
-    touched = shrunk(scale, least, point) + wp.max(found.value, ZERO) * found.gradient
-    return wp.dot(toward_bar, found.gradient) + wp.dot(touched_bar, touched)
+        return wp.dot(by_toward, seen_from(solids, world, solid, turn, origin).gradient)
+    found = closer(solids, world, solid, turn, origin, at.scale, point)
+    least = wp.min(at.scale[0], wp.min(at.scale[1], at.scale[2]))
+    touched = shrunk(at.scale, least, point) + wp.max(found.value, ZERO) * found.gradient
+    return wp.dot(by_toward, found.gradient) + wp.dot(bar, touched)
+
+
+@wp.func
+def origin_in_solid(at: MetPair) -> tuple[vec3, mat33]:
+    """Origin of the first body's frame [m], and its turn, as the second body's solid sees them."""
+    inverse = wp.transpose(rotation_after(at.second, at.share))
+    turn = inverse * rotation_after(at.first, at.share)
+    h = at.timestep
+    apart = position_after(at.first, at.share, h) - position_after(at.second, at.share, h)
+    return inverse * apart + at.second.com - turn * at.first.com, turn
 
 
 @wp.func
@@ -200,22 +230,36 @@ def rotation_of(body: Body, row: StateRow, met: real, h: real) -> mat33:
 
 
 @wp.func
-def momentum_work(
-    body: Body, row: StateRow, push: Push, gravity: vec3, h: real, at: Moment, velocity: vec6, virtual: vec6
-) -> real:
-    """Work of what a body's momentum gains beyond gravity and control, along minus its virtual velocity."""
+def momentum_gained(
+    given: Given, world: int, i: int, row: StateRow, met: real, lead: real, velocity: vec6
+) -> vec6:
+    """What a body's momentum gains in a step beyond gravity and control, times −1 [kg m/s; kg m²/s, W]."""
+    body = given.bodies[world, i]
+    push = given.pushes[world, i]
+    h = given.timestep[world, 0]
     rotation = matrix(from_wxyz(row.orientation))
-    linear = body.mass * (row.velocity + h * gravity - linear_part(velocity)) + h * push.force
+    comes = row.velocity + h * given.gravity[world, 0]
+    linear = body.mass * (comes - linear_part(velocity)) + h * push.force
     inertia = turned_inertia(rotation, body.inertia)
     before = angular_momentum(rotation * row.omega, inertia, h, -ONE) + h * push.torque
-    inertia_met = turned_inertia(rotation_of(body, row, at.met, h), body.inertia)
-    after = angular_momentum(angular_part(velocity), inertia_met, h, at.lead)
-    return wp.dot(joined(linear, before - after), virtual)
+    inertia_met = turned_inertia(rotation_of(body, row, met, h), body.inertia)
+    return joined(linear, before - angular_momentum(angular_part(velocity), inertia_met, h, lead))
 
 
 @wp.func
-def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, bar: BodyState) -> real:
+def momentum_work(given: Given, world: int, i: int, velocity: vec6, virtual: vec6) -> real:
+    """Work of what a body's momentum gains beyond gravity and control, along minus its virtual velocity."""
+    state = given.seen[world, i]
+    row = given.state[world, i]
+    return wp.dot(momentum_gained(given, world, i, row, state.met, state.lead, velocity), virtual)
+
+
+@wp.func
+def state_work(given: Given, world: int, i: int, moves: bool, bar: BodyState) -> real:
     """⟨bar, what contact sees of a body at the start of a step⟩; quaternions as (x, y, z, w)."""
+    body = given.bodies[world, i]
+    row = given.state[world, i]
+    h = given.timestep[world, 0]
     q = from_wxyz(row.orientation)
     total = wp.dot(bar.position, row.position) + wp.dot(bar.orientation, q) + wp.dot(bar.com, body.com)
     ahead = q
@@ -227,7 +271,7 @@ def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, b
             inertia = turned_inertia(matrix(q), body.inertia)
             gain = gain_of_row(body, row, h)
             ahead_falling = turned(q, row.omega + gain, h)
-            total += h * wp.dot(bar.gain + bar.falls, gravity) + wp.dot(
+            total += h * wp.dot(bar.gain + bar.falls, given.gravity[world, 0]) + wp.dot(
                 bar.spin_gain + (HALF * h) * bar.lag, matrix(q) * gain
             )
             total += bar.inverse_mass / body.mass + wp.ddot(bar.inverse_inertia, wp.inverse(inertia))
@@ -236,172 +280,119 @@ def state_work(body: Body, row: StateRow, gravity: vec3, h: real, moves: bool, b
 
 @wp.func
 def advance_work(
-    body: Body, row: StateRow, velocity: vec6, moved: vec6, h: real, at: Moment, bar: StateRow
+    given: Given,
+    world: int,
+    i: int,
+    velocity: vec6,
+    moved: vec6,
+    bar: StateRow,
 ) -> real:
     """⟨bar, state of a body at the end of a step⟩; `moved` is the twist by which its pose changes."""
+    body = given.bodies[world, i]
+    row = given.state[world, i]
+    h = given.timestep[world, 0]
+    state = given.seen[world, i]
     q = from_wxyz(row.orientation)
-    v = linear_part(velocity)
     back = wp.transpose(matrix(q))
     turn = angular_part(moved)
     omega = back * angular_part(velocity)
-    if at.lead < ONE:
+    if state.lead < ONE:
         gain = matrix(q) * gain_of_row(body, row, h)
-        met = rotation_of(body, row, at.met, h)
-        end = end_of_impact(angular_part(velocity), body.inertia, met, gain, h, at.met, at.lead)
+        met = rotation_of(body, row, state.met, h)
+        end = end_of_impact(angular_part(velocity), body.inertia, met, gain, h, state.met, state.lead)
         omega = end.omega
         turn = turn + end.turn
     return (
         wp.dot(bar.position, row.position + h * linear_part(moved))
         + wp.dot(bar.orientation, to_wxyz(turned(q, back * turn, h)))
-        + wp.dot(bar.velocity, v)
+        + wp.dot(bar.velocity, linear_part(velocity))
         + wp.dot(bar.omega, omega)
     )
 
 
 @wp.func
-def impact_patch_work(
-    pose: PairPose,
-    sample: Sample,
-    d: Distance,
-    turning: int,
-    stiffness_share: real,
-    share: real,
-    h: real,
-    depth: real,
-    bounce: real,
-    rests: real,
-    bar: Patch,
-) -> real:
-    """⟨bar, what a sample adds to the patch of an impact⟩."""
-    point = point_contact(pose, sample, d, turning, False, stiffness_share, share * h)
-    own = patch_of_sample(
-        point.area, point.sunk, depth, point.approach, bounce, rests, point.arm, point.normal
-    )
-    return (
-        bar.load * own.load
-        + wp.dot(bar.arm, own.arm)
-        + wp.dot(bar.normal, own.normal)
-        + bar.near_load * own.near_load
-        + bar.near_rate * own.near_rate
-    )
+def late_work(given: Given, world: int, i: int, lost: vec6, late: vec6) -> real:
+    """Work of the momentum of a twist along another: μᵀ M D."""
+    body = given.bodies[world, i]
+    rotation = rotation_of(body, given.state[world, i], given.seen[world, i].met, given.timestep[world, 0])
+    along = wp.dot(linear_part(late), linear_part(lost))
+    turned_back = turned_inertia(rotation, body.inertia) * angular_part(lost)
+    return body.mass * along + wp.dot(angular_part(late), turned_back)
 
 
 @wp.func
 def impact_work(
-    first: BodyState,
-    second: BodyState,
+    at: MetPair,
     patch: Patch,
-    bounce: real,
+    material: Material,
     factor: real,
-    friction: real,
-    share: real,
-    h: real,
     turning: int,
     hits: bool,
     alone: bool,
+    waits: bool,
     bar: Impact,
 ) -> real:
-    """⟨bar, share and stiffness of an impact, and how points accelerate after it⟩."""
-    work = bar.share * share_of_impact(patch, bounce)
+    """⟨bar, impact of a pair⟩, without what it is given as it is.
+
+    `factor` is F; `hits` says whether bodies are deep enough, `alone` whether one is fixed and the other
+    moves freely, `waits` whether impulses take effect when they meet.
+    """
+    h = at.timestep
+    impact = no_impact(ZERO, ZERO, ZERO, h)
+    impact.share = share_of_impact(patch, material.bounce)
     if hits:
-        work += bar.stiffness * stiffness_of_impact(first, second, patch, bounce, factor, h)
+        impact.stiffness = stiffness_of_impact(at.first, at.second, patch, material.bounce, factor, h)
+        impact = delayed(impact, wp.where(waits, impact.share, ZERO), at.share, h)
         if alone:
-            turns = turning_after(first, second, patch, friction, share, turning)
-            work += wp.ddot(bar.turns.by_arm, turns.by_arm) + wp.dot(bar.turns.offset, turns.offset)
-    return work
+            impact.turns = turning_after(at.first, at.second, patch, material.friction, at.share, turning)
+    return impact_product(bar, impact)
 
 
 @wp.func
-def rest_work(
-    first: BodyState,
-    second: BodyState,
-    pose: PairPose,
-    sample: Sample,
-    d: Distance,
-    turning: int,
-    depth: real,
-    h: real,
-    bounce: real,
-    bar: Rest,
-) -> real:
-    """⟨bar, what a sample adds to what a pair rests on⟩."""
-    point = point_contact(pose, sample, d, turning, False, ONE, ZERO)
-    fall = fall_of(first, second, depth, h)
-    own = rest_of_sample(point.depth, fall, point.approach, bounce, point.arm, point.normal)
-    sums = bar.load * own.load + bar.near * own.near + bar.depth * own.depth
-    return sums + wp.dot(bar.arm, own.arm) + wp.dot(bar.normal, own.normal)
+def waiting_work(found: FoundPair, apart: vec3, twists: Virtual, met: real, lead: real) -> real:
+    """What an impulse that waits until its bodies meet makes of the equations besides its own work.
 
-
-body_product = product_of(BodyState)
+    That is the work of what they rest on until then, and ⟨bars, when angular momentum is balanced⟩; `apart`
+    is from the second centre of mass to the first when the step begins [m, W].
+    """
+    at_once = relative_twist(twists.first_virtual, twists.second_virtual, apart)
+    late = relative_twist(twists.first_late, twists.second_late, apart)
+    work = wp.dot(support_before(found), joined(at_once.velocity, at_once.spin))
+    work -= wp.dot(support_delayed(found), joined(late.velocity, late.spin))
+    return work + found.impact.delays * (met * found.share - lead)
 
 
 @wp.func
 def support_work(
-    first: BodyState,
-    second: BodyState,
+    at: MetPair,
     rest: Rest,
     depth: real,
-    friction: real,
-    h: real,
-    turning: int,
-    virtual: vec6,
-    second_virtual: vec6,
-    first_bar: BodyState,
-    second_bar: BodyState,
-    depth_bar: real,
+    material: Material,
     factor: real,
+    turning: int,
+    bar: vec6,
+    met_bar: MetPair,
+    depth_bar: real,
     rests_bar: real,
 ) -> real:
-    """Work of what a pair rests on along virtual velocities, and ⟨bars, bodies as they meet, their depth⟩."""
-    impulse = support_of(first, second, rest, friction, h, turning)
-    back = wrench_at(impulse, first.position - second.position)
-    work = wp.dot(impulse, virtual) - wp.dot(back, second_virtual) + depth_bar * depth_beside(rest, depth)
-    work += rests_bar * share_left_out(rest, factor)
-    return (
-        work
-        + body_product(first_bar, supported(first, impulse, h))
-        + body_product(second_bar, supported(second, -back, h))
-    )
+    """⟨bars, what a pair rests on while it nears an impact, its bodies as they meet, and their depth⟩."""
+    h = at.timestep
+    impulse = support_of(at.first, at.second, rest, material.friction, h, turning)
+    back = wrench_at(impulse, at.first.position - at.second.position)
+    total = wp.dot(bar, impulse) + depth_bar * depth_beside(rest, depth)
+    total += rests_bar * share_left_out(rest, factor)
+    total += body_product(met_bar.first, supported(at.first, impulse, h))
+    return total + body_product(met_bar.second, supported(at.second, -back, h))
 
 
 @wp.func
-def late_work(body: Body, row: StateRow, h: real, at: Moment, delayed: vec6, late: vec6) -> real:
-    """Work of the momentum of a twist along another: μᵀ M D."""
-    inertia = turned_inertia(rotation_of(body, row, at.met, h), body.inertia)
-    along = wp.dot(linear_part(late), linear_part(delayed))
-    return body.mass * along + wp.dot(angular_part(late), inertia * angular_part(delayed))
-
-
-def need_adjoints(function: Any, seen: set[int] | None = None) -> None:
-    """Have Warp generate the adjoint of a function and of all that it calls.
-
-    `wp.grad` asks for it by itself where nothing called the function before in the same kernel. Formulas of a
-    step have been called before, and would be left without: their derivatives would be zero without a word.
-    """
-    seen = set() if seen is None else seen
-    if id(function) in seen:
-        return
-    seen.add(id(function))
-    function.adj.force_adjoint_codegen = True
-    for name in _names_in(function.func.__code__):
-        called = function.func.__globals__.get(name)
-        if isinstance(called, wp.Function):
-            need_adjoints(called, seen)
-
-
-def after_adjoints(function: Any) -> Any:
-    """Have Warp emit a function after all adjoints, as those that call `wp.grad`: it calls one of them."""
-    function.adj.uses_grad_call = True
-    return function
-
-
-def _names_in(code: CodeType) -> set[str]:
-    """Global names that a function's code may refer to."""
-    return set(code.co_names).union(*(_names_in(c) for c in code.co_consts if isinstance(c, CodeType)))
+def fall_work(at: MetPair, depth: real, bar: real) -> real:
+    """⟨bar, how far bodies fall in a step⟩."""
+    return bar * fall_of(at.first, at.second, depth, at.timestep)
 
 
 for _function in (
-    point_work, distance_work, sample_distance, pair_work, apart_work, facing_work, momentum_work, state_work,
-    advance_work, impact_patch_work, impact_work, rest_work, support_work, late_work,
+    sample_work, distance_work, pose_work, apart_work, critical_work, facing_work, momentum_work, state_work,
+    advance_work, late_work, impact_work, waiting_work, support_work, fall_work,
 ):  # fmt: skip
     need_adjoints(_function)

@@ -4,33 +4,27 @@ import warp as wp
 
 from dano.engine.kernels.assembly import presses
 from dano.engine.kernels.derivatives.adjoint import (
-    after_adjoints,
     apart_work,
+    Asked,
+    critical_work,
     distance_work,
     facing_work,
-    impact_patch_work,
+    fall_work,
     impact_work,
-    pair_work,
-    point_work,
-    rest_work,
-    sample_distance,
+    MEETS,
+    MetPair,
+    origin_in_solid,
+    pose_work,
+    PRESSES,
+    RESTS,
+    sample_work,
     support_work,
+    Touching,
     Virtual,
-)
-from dano.engine.kernels.derivatives.pair_changes import add_distance_changes
-from dano.engine.kernels.derivatives.products import (
-    add_to_leaf,
-    add_to_material,
-    add_to_pose,
-    scaled_body,
-    scaled_leaf,
-    summed_body,
-    total_body,
-    total_material,
-    total_pose,
+    waiting_work,
 )
 from dano.engine.kernels.impacts import apart_at_start
-from dano.engine.kernels.lanes import total, total3, total6, total33
+from dano.engine.kernels.lanes import total, total_of
 from dano.engine.kernels.near import (
     as_they_meet,
     facing,
@@ -40,43 +34,31 @@ from dano.engine.kernels.near import (
     second_until,
     solid_of_body,
 )
-from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
-from dano.physics.features import TREES, UNIONS
-from dano.physics.impacts import fall_of, Impact, Patch, Rest
-from dano.physics.pairs import (
-    BALL,
-    BodyState,
-    falling,
-    falling_bar,
-    first_touch,
-    PairPose,
-    position_after,
-    rotation_after,
-)
+from dano.engine.kernels.tables import FoundPair, Room, Scene
+from dano.physics.features import KINDS, LANES, TREES, UNIONS
+from dano.physics.friction import Slip
+from dano.physics.impacts import fall_of
+from dano.physics.pairs import BALL, BodyState, falling, falling_bar, first_touch, PairPose
 from dano.physics.point_law import Material, point_motion, slip_at, slip_of
-from dano.physics.real import HALF, mat33, ONE, real, vec3, vec6, ZERO
-from dano.physics.samples import facing_area, position_in_solid, Sample, solid_normal
+from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.samples import facing_area, position_in_solid, solid_normal
 from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
-from dano.physics.solids.leaves import Distance
-from dano.physics.twists import joined, relative_twist
+from dano.physics.solids.grids import distance_change
+from dano.physics.solids.kinds import GRID
+from dano.physics.solids.leaves import Distance, Leaf
+from dano.physics.structures import adding_of, addition_of, after_adjoints, product_of, scaled_of, sum_of
+from dano.physics.twists import relative_twist
 
-_BALL = wp.constant(BALL)
+_BALL, _GRID, _LANES = wp.constant(BALL), wp.constant(GRID), wp.constant(LANES)
+_PRESSES, _MEETS, _RESTS = wp.constant(PRESSES), wp.constant(MEETS), wp.constant(RESTS)
 
 
-@wp.struct
-class PairBar:
-    """Derivatives by what a pair of bodies is at the start of a step, from its points."""
-
-    first: BodyState  # By the state of the sampled body
-    second: BodyState  # By that of the other
-    scale: vec3  # By the semi-axes of the sampled body
-    timestep: real  # By h
-    sink: real  # By the depth up to which predicted geometry is taken
-    impact_depth: real  # By δ
-    depth_beside: real  # By the depth at which a part meets, of a pair that rests on another
-    factor: real  # By F
-    deepest: real  # By the depth that another part may have
-    twists: Virtual  # By twists and virtual twists, of bodies on joints
+add_to_met, total_met = adding_of(MetPair), total_of(MetPair)
+scaled_met, summed_body = scaled_of(MetPair), sum_of(BodyState)
+add_to_touching, total_touching = adding_of(Touching), total_of(Touching)
+add_to_twists, total_twists = adding_of(Virtual), total_of(Virtual)
+add_to_leaf, add_to_material = addition_of(Leaf), addition_of(Material)
+distance_product = product_of(Distance)
 
 
 @wp.func
@@ -89,203 +71,114 @@ def leaf_at(scene: wp.ref[Scene], world: int, body: int, x: vec3) -> Solid:
 
 
 @wp.func
-def pull_sample(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    world: int,
-    lane: int,
-    s: int,
-    pose: PairPose,
-    solid: Solid,
-    x: vec3,
-    by_pose: PairPose,
-    by_sample: Sample,
-    by_distance: Distance,
-) -> PairPose:
-    """Add derivatives by a sample and the solid that it meets at x; returns those by the pose."""
-    _f, _g, by_solid, by_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_distance)
-    add_to_leaf(bars.leaves, world, solid.first, by_solid.leaf)
-    add_distance_changes(scene, room, world, lane, solid, x, by_distance)
-    # x = points · sample + origin
-    by_pose.points += wp.outer(by_x, scene.samples[world, s].point)
-    by_pose.origin += by_x
-    if bars.samples.shape[1] > 0:
-        bars.samples[world, s].point += by_sample.point + wp.transpose(pose.points) * by_x
-        bars.samples[world, s].area += by_sample.area
-    return by_pose
+def add_part(room: wp.ref[Room], world: int, lane: int, direction: int, change: real):
+    """Add to a lane's part of what changes in a direction make of a number."""
+    room.parts[world, direction * _LANES + lane] = room.parts[world, direction * _LANES + lane] + change
 
 
 @wp.func
-def pull_patch_of_impact(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    world: int,
-    lane: int,
-    found: FoundPair,
-    pose: PairPose,
-    patch_bar: Patch,
-) -> tuple[PairPose, real, real, real, real]:
-    """Derivatives by the pose of a pair, τ, h, δ and `left_out` from the patch of its impact, by lanes."""
-    index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
-    turning = scene.body_index[index.first].turning
-    h = scene.timestep[world, 0]
-    pose_bar = PairPose()
-    share_bar = real(0.0)
-    h_bar = real(0.0)
-    depth_bar = real(0.0)
-    rests_bar = real(0.0)
-    share_of_bar = real(0.0)
-    bounce_bar = real(0.0)
-    bounce = scene.materials[world, index.contact].bounce
-    for k in range(found.first, found.end):
-        where = room.where[world, k]
-        if room.points[world, k].sunk > -pair.impact_depth and where.presses_back == 0:
-            sample = scene.samples[world, where.sample]
-            x = position_in_solid(pose, sample.point)
-            solid = leaf_at(scene, world, index.second, x)
-            d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-            (
-                by_pose, by_sample, by_distance, _a, by_share_of, by_share, by_h, by_depth, by_bounce,
-                by_rests, _b,
-            ) = wp.grad(impact_patch_work)(
-                pose, sample, d, turning, pair.share, found.share, h, pair.impact_depth, bounce,
-                left_out(found, pair.factor), patch_bar,
-            )  # fmt: skip
-            by_pose = pull_sample(
-                scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
-            )
-            add_to_pose(pose_bar, by_pose)
-            share_bar += by_share
-            h_bar += by_h
-            depth_bar += by_depth
-            share_of_bar += by_share_of
-            bounce_bar += by_bounce
-            rests_bar += by_rests
-    share_of_bar = total(share_of_bar)
-    bounce_bar = total(bounce_bar)
-    if lane == 0:
-        if bars.pairs.shape[1] > 0:
-            bars.pairs[world, found.pair].share += share_of_bar
-        if bars.materials.shape[1] > 0:
-            bars.materials[world, index.contact].bounce += bounce_bar
-    return pose_bar, share_bar, h_bar, depth_bar, rests_bar
+def n_moving(scene: wp.ref[Scene], room: wp.ref[Room]) -> int:
+    """In how many directions coefficients of sampled solids change."""
+    if scene.solids.changes.shape[1] == 0:
+        return 0
+    return room.parts.shape[1] // _LANES
 
 
 @wp.func
-def pull_points(
+def pull_distance(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, solid: Solid, x: vec3, bar: Distance
+) -> vec3:
+    """Derivative by a point from one by the distance of a leaf there; adds those by the leaf."""
+    _a, _b, _c, by_leaf, by_x, _d = wp.grad(distance_work)(
+        scene.solids, world, solid.kind, solid.leaf, x, bar
+    )
+    add_to_leaf(room.bars.leaves, world, solid.first, by_leaf)
+    if wp.static(GRID in KINDS):
+        if solid.kind.kind == _GRID:
+            for k in range(n_moving(scene, room)):
+                moved = distance_change(scene.solids, world, solid.kind, solid.leaf, x, k)
+                add_part(room, world, lane, k, distance_product(bar, moved))
+    return by_x
+
+
+@wp.func
+def pull_samples(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
-    bars: wp.ref[Changes],
     world: int,
     lane: int,
+    what: int,
     found: FoundPair,
-    pose: PairPose,
-    rebound: real,
+    at: Touching,
     twists: Virtual,
-) -> tuple[PairPose, real, real, Impact, Virtual]:
-    """Derivatives by the pose of a pair, τ, h, its impact and twists from its points; each lane's part.
+    asked: Asked,
+) -> tuple[Touching, Virtual]:
+    """Derivatives by what the samples of a pair depend on, of all lanes; adds those by samples and solids.
 
-    Adds those by samples, solids and materials.
+    Those by twists are only there with bodies on joints.
+
+    `what` is asked of them, see `PRESSES`.
     """
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
-    material = scene.materials[world, index.contact]
-    h = scene.timestep[world, 0]
-    pose_bar = PairPose()
-    share_bar = real(0.0)
-    h_bar = real(0.0)
-    material_bar = Material()
-    stiffness_share_bar = real(0.0)
-    impact_bar = Impact()
+    bar = Touching()
     twists_bar = Virtual()
-    twist = relative_twist(twists.first, twists.second, pose.com_difference)
+    twist = relative_twist(twists.first, twists.second, at.pose.com_difference)
     for k in range(found.first, found.end):
-        if presses(room, world, k):
-            linear = room.linear[world, k]
-            where = room.where[world, k]
-            point = room.points[world, k]
-            law = room.laws[world, k]
-            motion = slip_of(law, point_motion(point, twist.velocity, twist.spin))
-            at = slip_at(law, motion.slip, linear.grip)
+        where = room.where[world, k]
+        counts = presses(room, world, k)
+        if what != _PRESSES:
+            counts = where.presses_back == 0
+            if what == _MEETS:
+                counts = counts and room.points[world, k].sunk > -at.depth
+        if counts:
             sample = scene.samples[world, where.sample]
-            x = position_in_solid(pose, sample.point)
+            x = position_in_solid(at.pose, sample.point)
             solid = leaf_at(scene, world, index.second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-            (
-                by_pose, by_sample, by_distance, _a, _b, by_share_of, by_share, by_h, by_material, _c,
-                by_impact, by_twists, _d,
-            ) = wp.grad(point_work)(
-                pose, sample, d, turning, where.presses_back > 0, pair.share, found.share, h, material,
-                rebound, found.impact, twists, at,
-            )  # fmt: skip
-            by_pose = pull_sample(
-                scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample, by_distance
-            )
-            add_to_pose(pose_bar, by_pose)
-            impact_bar.share += by_impact.share
-            impact_bar.stiffness += by_impact.stiffness
-            impact_bar.depth += by_impact.depth
-            impact_bar.factor += by_impact.factor
-            impact_bar.deepest += by_impact.deepest
-            impact_bar.delays += by_impact.delays
-            impact_bar.way += by_impact.way
-            impact_bar.rest += by_impact.rest
-            impact_bar.after += by_impact.after
-            impact_bar.rests += by_impact.rests
-            impact_bar.turns.by_arm += by_impact.turns.by_arm
-            impact_bar.turns.offset += by_impact.turns.offset
-            add_to_material(material_bar, by_material)
-            share_bar += by_share
-            h_bar += by_h
-            stiffness_share_bar += by_share_of
-            if wp.static(TREES):
-                twists_bar.first += by_twists.first
-                twists_bar.second += by_twists.second
-                twists_bar.first_virtual += by_twists.first_virtual
-                twists_bar.second_virtual += by_twists.second_virtual
-    material_bar = total_material(material_bar)
-    stiffness_share_bar = total(stiffness_share_bar)
-    if lane == 0:
-        if bars.materials.shape[1] > 0:
-            whole = bars.materials[world, index.contact]
-            add_to_material(whole, material_bar)
-            bars.materials[world, index.contact] = whole
-        if bars.pairs.shape[1] > 0:
-            bars.pairs[world, found.pair].share += stiffness_share_bar
+            slip = Slip()
+            if what == _PRESSES:
+                law = room.laws[world, k]
+                motion = slip_of(law, point_motion(room.points[world, k], twist.velocity, twist.spin))
+                slip = slip_at(law, motion.slip, room.linear[world, k].grip)
+            if what == _RESTS:
+                counts = d.value < at.fall and facing_area(at.pose, sample, solid_normal(d.gradient)) > ZERO
+            if counts:
+                _a, by, by_twists, by_sample, by_distance, _b, _c, _d, _e = wp.grad(sample_work)(
+                    what, at, twists, sample, d, turning, where.presses_back > 0, slip, asked
+                )
+                by_x = pull_distance(scene, room, world, lane, solid, x, by_distance)
+                # x = points · sample + origin
+                by.pose.points = by.pose.points + wp.outer(by_x, sample.point)
+                by.pose.origin = by.pose.origin + by_x
+                add_to_touching(bar, by)
+                if wp.static(TREES):
+                    add_to_twists(twists_bar, by_twists)
+                if room.bars.samples.shape[1] > 0:
+                    by_point = by_sample.point + wp.transpose(at.pose.points) * by_x
+                    room.bars.samples[world, where.sample].point += by_point
+                    room.bars.samples[world, where.sample].area += by_sample.area
     if wp.static(TREES):
-        twists_bar.first = total6(twists_bar.first)
-        twists_bar.second = total6(twists_bar.second)
-        twists_bar.first_virtual = total6(twists_bar.first_virtual)
-        twists_bar.second_virtual = total6(twists_bar.second_virtual)
-    return pose_bar, share_bar, h_bar, impact_bar, twists_bar
+        twists_bar = total_twists(twists_bar)
+    return total_touching(bar), twists_bar
 
 
 @wp.func
-def solved_fixed_point(
-    scene: wp.ref[Scene],
-    world: int,
-    solid: Solid,
-    a: BodyState,
-    b: BodyState,
-    share: real,
-    h: real,
-    scale: vec3,
-    point: vec3,
-    point_bar: vec3,
+def facing_point_bar(
+    scene: wp.ref[Scene], world: int, solid: Solid, at: MetPair, point: vec3, toward_bar: vec3
 ) -> vec3:
-    """(1 − ∂G/∂x)⁻ᵀ x̄ of the search for the first touch, x = G(x)."""
-    rows = mat33()
+    """Derivative by where the search for the first touch ended, x = G(x): (1 − ∂G/∂x)⁻ᵀ x̄."""
     zero = vec3()
+    _a, _b, _c, _d, _e, point_bar, _f, _g = wp.grad(facing_work)(
+        scene.solids, world, solid, at, _BALL, point, toward_bar, zero
+    )
+    rows = mat33()
     k = int(0)
     while k < 3:
         unit = vec3()
         unit[k] = ONE
-        _a, _b, _c, _d, _e, _f, _g, _h, _i, by_point, _j, _k = wp.grad(facing_work)(
-            scene.solids, world, solid, a, b, share, h, _BALL, scale, point, zero, unit
+        _h, _i, _j, _k, _l, by_point, _m, _n = wp.grad(facing_work)(
+            scene.solids, world, solid, at, _BALL, point, zero, unit
         )
         rows[k] = unit - by_point
         k += 1
@@ -294,194 +187,92 @@ def solved_fixed_point(
 
 @wp.func
 def pull_facing(
-    scene: wp.ref[Scene],
-    bars: wp.ref[Changes],
-    world: int,
-    lane: int,
-    first: int,
-    second: int,
-    a: BodyState,
-    b: BodyState,
-    share: real,
-    toward_bar: vec3,
-    bar: PairBar,
-) -> tuple[PairBar, real]:
-    """Add derivatives through the direction that samples face; returns the one by τ, too.
+    scene: wp.ref[Scene], world: int, second: int, turning: int, at: MetPair, toward_bar: vec3
+) -> tuple[MetPair, int, Leaf]:
+    """Derivatives through the direction that samples face: by the pair, and by a leaf and which it is.
 
     A ball or an ellipsoid faces where the search for its first touch ended: a fixed point of the search,
     differentiated by the implicit function theorem.
     """
-    h = scene.timestep[world, 0]
-    turning = scene.body_index[first].turning
-    scale = scene.bodies[world, first].scale
-    inverse = wp.transpose(rotation_after(b, share))
-    turn = inverse * rotation_after(a, share)
-    com = inverse * (position_after(a, share, h) - position_after(b, share, h)) + b.com
-    origin = com - turn * a.com
+    origin, turn = origin_in_solid(at)
     point = vec3()
     solid = leaf_at(scene, world, second, origin)
-    touched_bar = vec3()
+    point_bar = vec3()
     if turning == _BALL:
         whole = solid_of_body(scene, world, second)
-        point = first_touch(scene.solids, world, whole, turn, origin, scale)
+        point = first_touch(scene.solids, world, whole, turn, origin, at.scale)
         solid = leaf_at(scene, world, second, origin + turn * point)
-        _a, _b, _c, _d, _e, _f, _g, _h, _i, by_point, _j, _k = wp.grad(facing_work)(
-            scene.solids, world, solid, a, b, share, h, turning, scale, point, toward_bar, touched_bar
-        )
-        touched_bar = solved_fixed_point(scene, world, solid, a, b, share, h, scale, point, by_point)
-    _l, _m, by_solid, by_first, by_second, by_share, by_h, _n, by_scale, _o, _p, _q = wp.grad(facing_work)(
-        scene.solids, world, solid, a, b, share, h, turning, scale, point, toward_bar, touched_bar
+        point_bar = facing_point_bar(scene, world, solid, at, point, toward_bar)
+    _a, _b, by_solid, bar, _c, _d, _e, _f = wp.grad(facing_work)(
+        scene.solids, world, solid, at, turning, point, toward_bar, point_bar
     )
-    if lane == 0:
-        add_to_leaf(bars.leaves, world, solid.first, by_solid.leaf)
-    bar.first = summed_body(bar.first, by_first)
-    bar.second = summed_body(bar.second, by_second)
-    bar.scale += by_scale
-    bar.timestep += by_h
-    return bar, by_share
+    return bar, solid.first, by_solid.leaf
 
 
 @wp.func
 def pull_pose(
     scene: wp.ref[Scene],
-    bars: wp.ref[Changes],
+    room: wp.ref[Room],
     world: int,
     lane: int,
     found: FoundPair,
-    a: BodyState,
-    b: BodyState,
+    at: MetPair,
     pose: PairPose,
-    pose_bar: PairPose,
-    points_share_bar: real,
-    points_h_bar: real,
-) -> PairBar:
-    """Derivatives by the states of a pair's bodies from those by its pose, τ and h.
+    by: Touching,
+) -> tuple[MetPair, real]:
+    """Derivatives by a pair's bodies, and by the depth at which they meet, from those by its pose, τ and h.
 
     One lane alone comes here: Warp itself adds those by coefficients.
     """
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
     turning = scene.body_index[index.first].turning
-    scale = scene.bodies[world, index.first].scale
-    h = scene.timestep[world, 0]
-    share_bar = points_share_bar
-    bar = PairBar()
-    toward = found.toward
-    by_first, by_second, by_share, by_h, by_toward, _a, by_scale, _b, _c = wp.grad(pair_work)(
-        a, b, found.share, h, toward, turning, scale, pair.follows, pose_bar
-    )
-    bar.first = by_first
-    bar.second = by_second
-    bar.scale = by_scale
-    bar.timestep = points_h_bar + by_h
-    share_bar += by_share
-    toward_bar = by_toward
+    bar, _a, _b, _c = wp.grad(pose_work)(at, turning, scene.pairs[world, found.pair].follows, by.pose)
+    bar.share += by.share
+    bar.timestep += by.timestep
+    depth_bar = real(0.0)
     if found.critical >= 0:
         # τ is the root of distance + depth = 0 at the critical sample.
         critical = scene.samples[world, found.critical].point
-        solid = leaf_at(scene, world, index.second, position_in_solid(pose, critical))
-        _d, _e, of_solid, of_first, of_second, of_share, of_h, of_toward, _f, of_scale, of_sample = wp.grad(
-            sample_distance
-        )(scene.solids, world, solid, a, b, found.share, h, toward, turning, scale, critical)
-        slope = of_share
+        x = position_in_solid(pose, critical)
+        solid = leaf_at(scene, world, index.second, x)
+        d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
+        of, _d, of_sample, _e = wp.grad(critical_work)(at, turning, critical, d.gradient)
+        slope = of.share
+        share_bar = bar.share
         if turning > 0:
-            none = PairBar()
-            spare = Changes()
-            _h, along = pull_facing(
-                scene, spare, world, lane, index.first, index.second, a, b, found.share, of_toward, none
-            )
-            slope += along
+            along, _f, _g = pull_facing(scene, world, index.second, turning, at, of.toward)
+            slope += along.share
             # What the points feel of the direction that they face depends on τ, too.
-            _i, turns = pull_facing(
-                scene, spare, world, lane, index.first, index.second, a, b, found.share, toward_bar, none
-            )
-            share_bar += turns
+            turns, _h, _i = pull_facing(scene, world, index.second, turning, at, bar.toward)
+            share_bar += turns.share
         if slope < ZERO:
-            share = -share_bar / slope
-            bar.first = summed_body(bar.first, scaled_body(share, of_first))
-            bar.second = summed_body(bar.second, scaled_body(share, of_second))
-            bar.scale += share * of_scale
-            bar.timestep += share * of_h
-            if found.hits > 0 and wp.length_sq(found.support) > ZERO:
-                bar.depth_beside += share
-            elif found.hits > 0 or pair.impact_depth > pair.sink:
-                bar.impact_depth += share
-            else:
-                bar.sink += share
-            toward_bar += share * of_toward
-            if lane == 0:
-                add_to_leaf(bars.leaves, world, solid.first, scaled_leaf(share, of_solid.leaf))
-                if bars.samples.shape[1] > 0:
-                    bars.samples[world, found.critical].point += share * of_sample
+            depth_bar = -share_bar / slope
+            add_to_met(bar, scaled_met(depth_bar, of))
+            of_distance = Distance()
+            of_distance.value = depth_bar
+            _j = pull_distance(scene, room, world, lane, solid, x, of_distance)
+            if room.bars.samples.shape[1] > 0:
+                room.bars.samples[world, found.critical].point += depth_bar * of_sample
     if turning > 0:
-        bar, _j = pull_facing(
-            scene, bars, world, lane, index.first, index.second, a, b, found.share, toward_bar, bar
-        )
-    return bar
+        faces, leaf, by_leaf = pull_facing(scene, world, index.second, turning, at, bar.toward)
+        add_to_leaf(room.bars.leaves, world, leaf, by_leaf)
+        add_to_met(bar, faces)
+    return bar, depth_bar
 
 
 @wp.func
-def support_twists(apart: vec3, twists: Virtual) -> tuple[vec6, vec6]:
-    """Virtual twists of a pair's first body against its second: as they are, and of delayed impulses."""
-    along = relative_twist(twists.first_virtual, twists.second_virtual, apart)
-    late = relative_twist(twists.first_late, twists.second_late, apart)
-    return joined(along.velocity, along.spin), joined(late.velocity, late.spin)
-
-
-@wp.func
-def pull_rest(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    world: int,
-    lane: int,
-    found: FoundPair,
-    a: BodyState,
-    b: BodyState,
-    pose: PairPose,
-    rest_bar: Rest,
-) -> tuple[PairPose, PairBar]:
-    """Derivatives by the pose with which a step begins, and by the bodies, from what a pair rests on."""
-    index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
-    turning = scene.body_index[index.first].turning
-    bounce = scene.materials[world, index.contact].bounce
-    h = scene.timestep[world, 0]
-    fall = fall_of(a, b, pair.impact_depth, h)
-    pose_bar = PairPose()
-    bar = PairBar()
-    first_bar = vec3()
-    second_bar = vec3()
-    bounce_bar = real(0.0)
-    for k in range(found.first, found.end):
-        where = room.where[world, k]
-        if where.presses_back == 0:
-            sample = scene.samples[world, where.sample]
-            x = position_in_solid(pose, sample.point)
-            solid = leaf_at(scene, world, index.second, x)
-            d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-            if d.value < fall and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
-                by_first, by_second, by_pose, by_sample, by_distance, _a, by_depth, by_h, by_bounce, _b = (
-                    wp.grad(rest_work)(a, b, pose, sample, d, turning, pair.impact_depth, h, bounce, rest_bar)
-                )
-                by_pose = pull_sample(
-                    scene, room, bars, world, lane, where.sample, pose, solid, x, by_pose, by_sample,
-                    by_distance,
-                )  # fmt: skip
-                add_to_pose(pose_bar, by_pose)
-                first_bar += by_first.falls
-                second_bar += by_second.falls
-                bar.impact_depth += by_depth
-                bar.timestep += by_h
-                bounce_bar += by_bounce
-    bar.first.falls = total3(first_bar)
-    bar.second.falls = total3(second_bar)
-    bar.impact_depth = total(bar.impact_depth)
-    bar.timestep = total(bar.timestep)
-    bounce_bar = total(bounce_bar)
-    if lane == 0 and bars.materials.shape[1] > 0:
-        bars.materials[world, index.contact].bounce += bounce_bar
-    return total_pose(pose_bar), bar
+def met_pair(
+    scene: wp.ref[Scene], world: int, found: FoundPair, a: BodyState, b: BodyState, share: real, toward: vec3
+) -> MetPair:
+    """Bodies of a pair after a share of the step."""
+    at = MetPair()
+    at.first = a
+    at.second = b
+    at.scale = scene.bodies[world, scene.pair_index[found.pair].first].scale
+    at.share = share
+    at.timestep = scene.timestep[world, 0]
+    at.toward = toward
+    return at
 
 
 @after_adjoints
@@ -489,63 +280,52 @@ def pull_rest(
 def pull_support(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
-    bars: wp.ref[Changes],
     world: int,
     lane: int,
     found: FoundPair,
-    twists: Virtual,
+    support_bar: vec6,
     rests_bar: real,
-    bar: PairBar,
-) -> PairBar:
-    """Derivatives by bodies that fall, from those by bodies that something supports while they do.
+    depth_bar: real,
+    bar: MetPair,
+) -> MetPair:
+    """Derivatives by bodies that fall, from those by bodies as they meet that something supports until then.
 
-    Args:
-        scene: The scene.
-        room: Room.
-        bars: Added to.
-        world: Which world.
-        lane: Which lane.
-        found: The pair.
-        twists: Of its bodies.
-        rests_bar: Derivative by `left_out`, of all lanes.
-        bar: Derivatives by bodies as they meet, of the first lane.
+    The others are those by what supports them, by `left_out` and by the depth at which they meet.
     """
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
-    material = scene.materials[world, index.contact]
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
     a = falling(room.bodies[world, index.first], found.first_falls)
     b = falling(room.bodies[world, index.second], found.second_falls)
-    share = found.impact.part * found.impact.delays
-    before = share * (HALF + found.share)
-    late = share * (HALF * found.share * found.share)
-    (
-        by_first, by_second, rest_bar, by_depth, by_friction, by_h, _a, _b, _c, _d, _e, _f, by_factor,
-        _g,
-    ) = wp.grad(support_work)(
-        a, b, found.rest, pair.impact_depth, material.friction, h, turning,
-        before * twists.first_virtual - late * twists.first_late,
-        before * twists.second_virtual - late * twists.second_late,
-        total_body(bar.first), total_body(bar.second), total(bar.depth_beside), pair.factor, rests_bar,
+    toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
+    at = met_pair(scene, world, found, a, b, ZERO, toward)
+    samples = Touching()
+    samples.material = scene.materials[world, index.contact]
+    samples.timestep = h
+    samples.pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
+    samples.fall = fall_of(a, b, pair.impact_depth, h)
+    asked = Asked()
+    whole, by_rest, by_depth, by_material, by_factor, _a, _b, _c, _d, _e = wp.grad(support_work)(
+        at, found.rest, pair.impact_depth, samples.material, pair.factor, turning, support_bar,
+        total_met(bar), total(depth_bar), rests_bar,
     )  # fmt: skip
-    start = found
-    start.share = ZERO
-    start.critical = -1
-    start.toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
-    pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
-    pose_bar, rests = pull_rest(scene, room, bars, world, lane, found, a, b, pose, rest_bar)
+    asked.rest = by_rest
+    by, _f = pull_samples(scene, room, world, lane, _RESTS, found, samples, Virtual(), asked)
     if lane == 0:
-        of_start = pull_pose(scene, bars, world, lane, start, a, b, pose, pose_bar, ZERO, rests.timestep)
-        bar.first = summed_body(summed_body(by_first, of_start.first), rests.first)
-        bar.second = summed_body(summed_body(by_second, of_start.second), rests.second)
-        bar.scale += of_start.scale
-        bar.timestep += by_h + of_start.timestep
-        bar.impact_depth += by_depth + rests.impact_depth
-        bar.factor += by_factor
-        if bars.materials.shape[1] > 0:
-            bars.materials[world, index.contact].friction += by_friction
-    return bar
+        start = found
+        start.critical = -1
+        begins, _g = pull_pose(scene, room, world, lane, start, at, samples.pose, by)
+        falls, of_depth, _h = wp.grad(fall_work)(at, pair.impact_depth, by.fall)
+        add_to_met(whole, begins)
+        add_to_met(whole, falls)
+        whole.scale += bar.scale
+        whole.timestep += bar.timestep
+        room.bars.pairs[world, found.pair].factor += by_factor
+        room.bars.pairs[world, found.pair].impact_depth += by_depth + of_depth
+        add_to_material(room.bars.materials, world, index.contact, by_material)
+        add_to_material(room.bars.materials, world, index.contact, by.material)
+    return whole
 
 
 @after_adjoints
@@ -553,122 +333,102 @@ def pull_support(
 def pull_pair(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
-    bars: wp.ref[Changes],
     world: int,
     lane: int,
     found: FoundPair,
     rebound: real,
     twists: Virtual,
-    moment_bar: Moment,
-    apart_bar: vec3,
-) -> PairBar:
-    """Derivatives by the states of a pair's bodies, for the first lane; adds those by all else.
+    met_bar: real,
+    lead_bar: real,
+) -> tuple[MetPair, Virtual]:
+    """Derivatives by a pair's bodies, for the first lane, and by twists; adds those by all else.
 
-    Args:
-        scene: The scene.
-        room: Room.
-        bars: Added to.
-        world: Which world.
-        lane: Which lane.
-        found: The pair.
-        rebound: Share of the restitution that counts.
-        twists: Of its bodies.
-        moment_bar: Derivatives by when the angular momenta of its bodies are balanced.
-        apart_bar: … by the way between their centres of mass, besides those through points.
+    `rebound` is the share of the restitution that counts; the bars are the pair's part of those by when the
+    angular momentum of its bodies is balanced.
     """
     index = scene.pair_index[found.pair]
     pair = scene.pairs[world, found.pair]
+    turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
     a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
-    pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
-    pose.com_difference = found.com_difference
-    pose_bar, share_bar, h_bar, impact_bar, twists_bar = pull_points(
-        scene, room, bars, world, lane, found, pose, rebound, twists
-    )
-    by_first = BodyState()
-    by_second = BodyState()
-    of_first, of_second, by_first_until, by_second_until, by_h_apart, _e = wp.grad(apart_work)(
-        a, b, first_until(found), second_until(found), h, total3(pose_bar.com_difference) + apart_bar
+    at = met_pair(scene, world, found, a, b, found.share, found.toward)
+    samples = Touching()
+    samples.pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
+    samples.pose.com_difference = found.com_difference
+    samples.share = found.share
+    samples.timestep = h
+    samples.stiffness_share = pair.share
+    samples.depth = pair.impact_depth
+    samples.rests = left_out(found, pair.factor)
+    samples.material = scene.materials[world, index.contact]
+    samples.impact = found.impact
+    restores = ONE
+    if samples.material.instant > ZERO:
+        restores = rebound
+    samples.material.restitution = restores * samples.material.restitution
+    asked = Asked()
+    by, by_twists = pull_samples(scene, room, world, lane, _PRESSES, found, samples, twists, asked)
+    by.material.restitution = restores * by.material.restitution
+    by.rests = by.impact.rests
+    factor_bar = by.impact.factor
+    bar, by_first_until, by_second_until, _j = wp.grad(apart_work)(
+        at, first_until(found), second_until(found), by.pose.com_difference
     )
     by_until = real(found.first_waits) * by_first_until + real(found.second_waits) * by_second_until
-    impact_bar.depth = total(impact_bar.depth)
-    impact_bar.factor = total(impact_bar.factor)
-    impact_bar.deepest = total(impact_bar.deepest)
-    rests_bar = real(0.0)
+    by.impact.delays += found.share * by_until
+    by.share += found.impact.delays * by_until
+    support_bar = vec6()
     if found.impact.share > ZERO:
-        impact_bar.share = total(impact_bar.share)
-        impact_bar.stiffness = total(impact_bar.stiffness)
         hits = found.impact.stiffness > ZERO
-        if hits:
-            # What `delayed` says, with β for `delays` where that is not zero; and of the balance.
-            delays = found.impact.delays
-            if found.share > ZERO:
-                share_bar += (ONE - delays) * impact_bar.way
-            share_bar -= delays * h * impact_bar.rest
-            h_bar += (ONE - delays * found.share) * impact_bar.rest
-            share_bar -= h * impact_bar.after
-            h_bar += (HALF - found.share) * impact_bar.after
-            by_delays = impact_bar.delays - wp.max(found.share, ZERO) * impact_bar.way
-            by_delays -= found.share * h * impact_bar.rest
-            by_delays = total(by_delays) + found.share * (moment_bar.met + by_until) - moment_bar.lead
-            if wp.static(not TREES):
-                # What the pair rests on until it meets.
-                along, late = support_twists(apart_at_start(scene, room, world, found), twists)
-                worked = found.impact.part * wp.dot(found.support, along)
-                delayed = found.impact.part * wp.dot(found.support, late)
-                half = HALF * found.share * found.share
-                by_delays += (HALF + found.share) * worked - half * delayed
-                if lane == 0:
-                    share_bar += delays * (worked - found.share * delayed)
-            if delays > ZERO:
-                impact_bar.share += by_delays
-        else:
-            h_bar += impact_bar.rest
-        bounce = scene.materials[world, index.contact].bounce
-        friction = scene.materials[world, index.contact].friction
-        turning = scene.body_index[index.first].turning
         alone = bool(False)
         if wp.static(not TREES):
             alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
-        impact_bar.turns.by_arm = total33(impact_bar.turns.by_arm)
-        impact_bar.turns.offset = total3(impact_bar.turns.offset)
-        (
-            by_first, by_second, patch_bar, by_bounce, by_factor, by_friction, by_share_of, by_h, _a, _b, _c,
-            _d,
-        ) = wp.grad(impact_work)(
-            a, b, found.patch, bounce, pair.factor, friction, found.share, h, turning, hits, alone, impact_bar
+            if hits:
+                apart = apart_at_start(scene, room, world, found)
+                by_found, by_apart, _a, _b, _c = wp.grad(waiting_work)(
+                    found, apart, twists, met_bar, lead_bar
+                )
+                by.impact.delays += by_found.impact.delays
+                by.share += by_found.share
+                support_bar = by_found.support
+                bar.first.position += by_apart
+                bar.second.position -= by_apart
+        by_impact, by_patch, by_material, by_factor, _d, _e, _f, _g, _h = wp.grad(impact_work)(
+            at, found.patch, scene.materials[world, index.contact], pair.factor, turning, hits, alone,
+            found.impact.delays > ZERO, by.impact,
         )  # fmt: skip
-        impact_bar.factor += by_factor
-        by_pose, by_share, by_h_of_patch, by_depth, by_rests = pull_patch_of_impact(
-            scene, room, bars, world, lane, found, pose, patch_bar
-        )
-        add_to_pose(pose_bar, by_pose)
-        share_bar += by_share
-        h_bar += by_h_of_patch
-        impact_bar.depth += total(by_depth)
-        rests_bar = total(by_rests) + total(impact_bar.rests)
+        asked.patch = by_patch
+        of_patch, _i = pull_samples(scene, room, world, lane, _MEETS, found, samples, twists, asked)
+        add_to_touching(by, of_patch)
+        # What follows from when they meet is left to where that is.
+        by.share += by_impact.share
+        by_impact.share = ZERO
+        add_to_met(bar, by_impact)
+        factor_bar += by_factor
         if lane == 0:
-            h_bar += by_h
-            share_bar += by_share_of
-            if bars.materials.shape[1] > 0:
-                bars.materials[world, index.contact].bounce += by_bounce
-                bars.materials[world, index.contact].friction += by_friction
-    pose_bar = total_pose(pose_bar)
-    share_bar = total(share_bar) + found.impact.delays * (moment_bar.met + by_until)
-    h_bar = total(h_bar) + by_h_apart
-    bar = PairBar()
+            add_to_material(room.bars.materials, world, index.contact, by_material)
+    depth_bar = real(0.0)
     if lane == 0:
-        bar = pull_pose(scene, bars, world, lane, found, a, b, pose, pose_bar, share_bar, h_bar)
-        bar.first = summed_body(summed_body(bar.first, by_first), of_first)
-        bar.second = summed_body(summed_body(bar.second, by_second), of_second)
-        bar.impact_depth += impact_bar.depth
-        bar.factor += impact_bar.factor
-        bar.deepest += impact_bar.deepest
+        of_pose, depth_bar = pull_pose(scene, room, world, lane, found, at, samples.pose, by)
+        add_to_met(bar, of_pose)
+        add_to_material(room.bars.materials, world, index.contact, by.material)
+        room.bars.pairs[world, found.pair].share += by.stiffness_share
+        room.bars.pairs[world, found.pair].impact_depth += by.depth + by.impact.depth
+        room.bars.pairs[world, found.pair].factor += factor_bar
+        room.bars.pairs[world, found.pair].deepest += by.impact.deepest
+        rests = found.hits > 0 and wp.length_sq(found.support) > ZERO
+        if not rests and (found.hits > 0 or pair.impact_depth > pair.sink):
+            room.bars.pairs[world, found.pair].impact_depth += depth_bar
+        elif not rests:
+            room.bars.pairs[world, found.pair].sink += depth_bar
+        if not rests:
+            depth_bar = ZERO
+    else:
+        bar = MetPair()
     if wp.static(not TREES):
         if wp.length_sq(found.support) > ZERO:
-            bar = pull_support(scene, room, bars, world, lane, found, twists, rests_bar, bar)
+            bar = pull_support(scene, room, world, lane, found, support_bar, by.rests, depth_bar, bar)
     if lane == 0:
         bar.first = falling_bar(bar.first, found.first_falls)
         bar.second = falling_bar(bar.second, found.second_falls)
-    bar.twists = twists_bar
-    return bar
+    return bar, by_twists

@@ -3,13 +3,18 @@
 import warp as wp
 
 from dano.engine.kernels.assembly import row_of, twist_of
-from dano.engine.kernels.derivatives.adjoint import after_adjoints, Virtual
-from dano.engine.kernels.derivatives.bodies import pull_advance, pull_body, pull_momentum
-from dano.engine.kernels.derivatives.contact import PairBar, pull_pair
+from dano.engine.kernels.derivatives.adjoint import (
+    advance_work,
+    late_work,
+    MetPair,
+    momentum_work,
+    state_work,
+    Virtual,
+)
+from dano.engine.kernels.derivatives.contact import pull_pair, summed_body
 from dano.engine.kernels.derivatives.patches import pull_patch
 from dano.engine.kernels.derivatives.trees import (
     add_hanging,
-    add_timestep,
     ask_of_end,
     follow_chains,
     pull_chains,
@@ -19,36 +24,141 @@ from dano.engine.kernels.derivatives.trees import (
     pull_places,
     transpose_entries,
 )
-from dano.engine.kernels.impacts import meetings_of
+from dano.engine.kernels.impacts import freed, meetings_of, pair_slope
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.linear_solve import copy_transposed_blocks, EVERYWHERE, solve_blocks
-from dano.engine.kernels.rollout import Launch, row_before
+from dano.engine.kernels.linear_solve import copy_blocks, copy_transposed_blocks, EVERYWHERE, solve_blocks
+from dano.engine.kernels.rollout import Launch, push_of, row_before
 from dano.engine.kernels.settled import block_of, hangs
-from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
+from dano.engine.kernels.tables import FoundPair, Room, Scene, StateRow
 from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals, solve_trees
 from dano.physics.features import LANES, PATCHES, TREES
-from dano.physics.real import ONE, vec3, vec6, ZERO
+from dano.physics.pairs import BodyState
+from dano.physics.real import ONE, real, vec6, ZERO
+from dano.physics.structures import after_adjoints, product_of
+from dano.physics.twists import shift
+
+_LANES = wp.constant(LANES)
+body_product, row_product = product_of(BodyState), product_of(StateRow)
+
+
+@wp.func
+def pull_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int):
+    """Add derivatives by a body's row and properties from those by its state, which are used up."""
+    bar = room.body_bars[world, i]
+    if not (body_product(bar, bar) == ZERO):
+        _a, _b, _c, _d, _e = wp.grad(state_work)(room.given, world, i, scene.body_index[i].row >= 0, bar)
+        room.body_bars[world, i] = BodyState()
+
+
+@wp.func
+def pull_momentum(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int):
+    """Add derivatives through the momentum that a body comes with, gravity and control."""
+    b = block_of(scene, scene.body_index[i].row)
+    _a, _b, _c, _d, _e = wp.grad(momentum_work)(
+        room.given, world, i, room.velocity[world, b], room.step[world, b]
+    )
+
+
+@wp.func
+def pull_advance(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, after: StateRow):
+    """Derivatives by the velocities and the row of a body from those by its row at the end of a step."""
+    m = scene.body_index[i].row
+    if m < 0:
+        room.bars.state[world, i] = after
+        return
+    b = block_of(scene, m)
+    room.residual[world, b] = vec6()
+    room.late[world, b] = vec6()
+    if not (row_product(after, after) == ZERO):
+        _a, _b, _c, by_velocity, by_moved, _e = wp.grad(advance_work)(
+            room.given, world, i, room.velocity[world, b], room.moved[world, b], after
+        )
+        room.residual[world, b] = by_velocity + by_moved
+        if wp.static(not TREES):
+            room.late[world, b] = freed(room, world, i, m, by_moved)
+
+
+@wp.func
+def subtract_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, found: FoundPair):
+    """Take what the delayed impulse of a pair makes of positions by its velocities off their derivatives."""
+    slope = pair_slope(scene, room, world, found)
+    if lane == 0:
+        index = scene.pair_index[found.pair]
+        a = scene.body_index[index.first].row
+        b = scene.body_index[index.second].row
+        t = shift(found.com_difference)
+        late = vec6()
+        if found.first_waits > 0:
+            late = room.late[world, a]
+        if found.second_waits > 0:
+            late = late - t * room.late[world, b]
+        by_twist = (found.impact.delays * found.share) * (wp.transpose(slope) * late)
+        if a >= 0:
+            room.residual[world, a] -= by_twist
+        if b >= 0:
+            room.residual[world, b] += wp.transpose(t) * by_twist
+
+
+@after_adjoints
+@wp.func
+def pull_delays(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
+    """Derivatives by velocities and by masses through impulses that take effect within the step."""
+    for f in range(n_found):
+        if room.found[world, f * _LANES + lane].impact.delays > ZERO:
+            subtract_slope(scene, room, world, lane, room.found[world, f * _LANES + lane])
+    wait()
+    if lane == 0:
+        for b in range(scene.n_blocks):
+            lost = room.velocity[world, b] - room.moved[world, b]
+            if wp.length_sq(lost) > ZERO:
+                _a, _b, _c, _d, _e = wp.grad(late_work)(
+                    room.given, world, scene.moving[b], lost, room.late[world, b]
+                )
+
 
 _LANES = wp.constant(LANES)
 
 
 @wp.func
-def solve_transposed(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int):
-    """Virtual velocities λ of a settled step, (∂R/∂V)ᵀ λ = V̄, in `room.step`, from V̄ in `room.residual`."""
+def take_step(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, t: int):
+    """What a step is given that others are not: its start and its controls, in `room.given`."""
+    for i in range(scene.body_index.shape[0]):
+        room.given.state[world, i] = row_before(scene, launch, world, t, i)
+        room.given.pushes[world, i] = push_of(scene, launch, world, t, i)
+    for c in range(scene.trees.coordinates.shape[0]):
+        drive = room.trees.joints[world, c].drive
+        room.given_trees.q[world, c] = drive.q
+        room.given_trees.v[world, c] = drive.v
+        room.given_trees.efforts[world, c] = drive.effort
+        room.given_trees.commands[world, c] = drive.command
+
+
+@wp.func
+def solve_settled(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, is_transposed: bool, again: bool
+):
+    """Solve ∂R/∂V of a settled step, or its transpose, for the right-hand side in `room.step`, in place.
+
+    Matrices of trees that touch nothing are factored once: not `again`.
+    """
     m = scene.n_blocks
-    copy_transposed_blocks(room, world, lane, m)
+    if is_transposed:
+        copy_transposed_blocks(room, world, lane, m)
+    else:
+        copy_blocks(room, world, lane, m, EVERYWHERE)
     wait()
-    if lane == 0:
-        for b in range(m):
-            room.step[world, b] = room.residual[world, b]
-        if wp.static(TREES):
-            transpose_entries(scene, room, world)
-            eliminate_joint_duals(scene, room, world, False)
-    wait()
-    solve_blocks(room, world, lane, m, EVERYWHERE)
     if wp.static(TREES):
         if lane == 0:
-            solve_trees(scene, room, world, False)
+            if is_transposed:
+                transpose_entries(scene, room, world)
+            eliminate_joint_duals(scene, room, world, again)
+        wait()
+    solve_blocks(room, world, lane, m, EVERYWHERE)
+    wait()
+    if wp.static(TREES):
+        if lane == 0:
+            solve_trees(scene, room, world, again)
+        wait()
 
 
 @wp.func
@@ -57,46 +167,27 @@ def is_moved(values: wp.array2d(dtype=vec6), world: int, block: int) -> bool:
     return not (wp.length_sq(values[world, block]) == ZERO)
 
 
-@after_adjoints
 @wp.func
-def pull_touching(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    launch: wp.ref[Launch],
-    world: int,
-    t: int,
-    found: FoundPair,
-    bar: PairBar,
+def add_to_body(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, bar: BodyState, twist: vec6, work: vec6
 ):
-    """Add derivatives by the two bodies of a pair."""
+    """Add derivatives by how contact sees a body, and by its twists if it is on a joint."""
+    room.body_bars[world, body] = summed_body(room.body_bars[world, body], bar)
+    row = scene.body_index[body].row
+    if hangs(scene, row):
+        add_hanging(room, world, row, twist, work)
+
+
+@wp.func
+def add_pair(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair, bar: MetPair, twists: Virtual
+):
+    """Add derivatives by what a pair with points is at the start of a step."""
     index = scene.pair_index[found.pair]
-    side = int(0)
-    while side < 2:
-        body = index.first
-        state = bar.first
-        twist = bar.twists.first
-        work = bar.twists.first_virtual
-        if side == 1:
-            body = index.second
-            state = bar.second
-            twist = bar.twists.second
-            work = bar.twists.second_virtual
-        row = scene.body_index[body].row
-        if hangs(scene, row):
-            add_hanging(room, world, row, state, twist, work)
-        else:
-            pull_body(scene, room, bars, world, body, row_before(scene, launch, world, t, body), state)
-        side += 1
-    if bars.bodies.shape[1] > 0:
-        bars.bodies[world, index.first].scale += bar.scale
-    add_timestep(bars, world, bar.timestep)
-    # Pairs with a patch stand behind those with points, and have no depth of their own.
-    if found.pair < bars.pairs.shape[1]:
-        bars.pairs[world, found.pair].sink += bar.sink
-        bars.pairs[world, found.pair].impact_depth += bar.impact_depth
-        bars.pairs[world, found.pair].factor += bar.factor
-        bars.pairs[world, found.pair].deepest += bar.deepest
+    add_to_body(scene, room, world, index.first, bar.first, twists.first, twists.first_virtual)
+    add_to_body(scene, room, world, index.second, bar.second, twists.second, twists.second_virtual)
+    room.bars.bodies[world, index.first].scale += bar.scale
+    room.bars.timestep[world, 0] += bar.timestep
 
 
 @after_adjoints
@@ -104,32 +195,40 @@ def pull_touching(
 def pull_end(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
-    bars: wp.ref[Changes],
     launch: wp.ref[Launch],
     world: int,
+    lane: int,
     t: int,
+    n_found: int,
 ):
     """Derivatives by what a step begins with, and by its velocities, from those by its end.
 
     The latter are in `room.residual`. Chains are those without virtual velocities, see `follow_chains`.
     """
-    if wp.static(TREES):
-        clear_trees(scene, world, room.residual)
-        pull_places(scene, room, bars, launch, world, t)
-    for i in range(scene.body_index.shape[0]):
-        if not hangs(scene, scene.body_index[i].row):
-            before = row_before(scene, launch, world, t, i)
-            pull_advance(scene, room, bars, world, i, before, room.after_bar[world, i])
-    if wp.static(TREES):
-        ask_of_end(scene, room, world)
-        pull_coordinates(scene, room, bars, world)
-        pull_chains(scene, room, bars, launch, world, t)
+    if lane == 0:
+        for i in range(scene.body_index.shape[0]):
+            room.bars.state[world, i] = StateRow()
+            room.body_bars[world, i] = BodyState()
+        if wp.static(TREES):
+            clear_trees(scene, world, room.residual)
+            pull_places(scene, room, launch, world, t)
+        for i in range(scene.body_index.shape[0]):
+            if not hangs(scene, scene.body_index[i].row):
+                pull_advance(scene, room, world, i, room.after_bar[world, i])
+        if wp.static(TREES):
+            ask_of_end(scene, room, world)
+            pull_coordinates(scene, room, world)
+            pull_chains(scene, room, world)
+    wait()
+    if wp.static(not TREES):
+        pull_delays(scene, room, world, lane, n_found)
+        wait()
 
 
 @wp.func
-def twists_of_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> Virtual:
+def twists_of_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, entry: int) -> Virtual:
     """How contact sees the bodies of a pair move at the end of the step, and with virtual velocities."""
-    index = scene.pair_index[found.pair]
+    index = scene.pair_index[room.found[world, entry].pair]
     first = scene.body_index[index.first].row
     second = scene.body_index[index.second].row
     twists = Virtual()
@@ -138,9 +237,9 @@ def twists_of_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: 
     twists.first_virtual = twist_of(scene, room, world, first, room.step, ZERO)
     twists.second_virtual = twist_of(scene, room, world, second, room.step, ZERO)
     if wp.static(not TREES):
-        if found.first_waits > 0:
+        if room.found[world, entry].first_waits > 0:
             twists.first_late = row_of(room.late, world, first)
-        if found.second_waits > 0:
+        if room.found[world, entry].second_waits > 0:
             twists.second_late = row_of(room.late, world, second)
     return twists
 
@@ -153,29 +252,25 @@ def is_moved_pair(twists: Virtual) -> bool:
 
 
 @wp.func
-def add_moment_bar(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, body: int, bar: wp.ref[Moment]
-):
-    """Add the part that one of the pairs for which a body waits has of when its momentum is balanced."""
-    count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
-    row = scene.body_index[body].row
-    bar.met += room.moment_bar[world, row].met / count
-    bar.lead += room.moment_bar[world, row].lead / count
-
-
-@wp.func
-def moment_bar_of(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, found: FoundPair
-) -> Moment:
+def balance_bars(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, entry: int
+) -> tuple[real, real]:
     """A pair's part of derivatives by when the angular momenta of its bodies are balanced."""
-    bar = Moment()
+    met = real(0.0)
+    lead = real(0.0)
     if wp.static(not TREES):
-        index = scene.pair_index[found.pair]
-        if found.first_waits > 0:
-            add_moment_bar(scene, room, world, n_found, index.first, bar)
-        if found.second_waits > 0:
-            add_moment_bar(scene, room, world, n_found, index.second, bar)
-    return bar
+        found = room.found[world, entry]
+        side = int(0)
+        while side < 2:
+            body = wp.where(
+                side == 0, scene.pair_index[found.pair].first, scene.pair_index[found.pair].second
+            )
+            if wp.where(side == 0, found.first_waits, found.second_waits) > 0:
+                count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
+                met += room.body_bars[world, body].met / count
+                lead += room.body_bars[world, body].lead / count
+            side += 1
+    return met, lead
 
 
 @after_adjoints
@@ -183,7 +278,6 @@ def moment_bar_of(
 def pull_equations(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
-    bars: wp.ref[Changes],
     launch: wp.ref[Launch],
     world: int,
     lane: int,
@@ -191,34 +285,41 @@ def pull_equations(
     n_found: int,
 ):
     """Add derivatives of −λ · R of a settled step, with virtual velocities λ in `room.step`."""
+    n = scene.body_index.shape[0]
     if lane == 0:
-        for i in range(scene.body_index.shape[0]):
+        for i in range(n):
             row = scene.body_index[i].row
             if row >= 0 and not hangs(scene, row) and is_moved(room.step, world, block_of(scene, row)):
-                pull_momentum(scene, room, bars, launch, world, t, i, row_before(scene, launch, world, t, i))
+                pull_momentum(scene, room, world, i)
     wait()
     for f in range(n_found):
-        found = room.found[world, f * _LANES + lane]
-        twists = twists_of_pair(scene, room, world, found)
-        moment_bar = moment_bar_of(scene, room, world, n_found, found)
-        if is_moved_pair(twists) or moment_bar.met != ZERO or moment_bar.lead != ZERO:
+        entry = f * _LANES + lane
+        twists = twists_of_pair(scene, room, world, entry)
+        met, lead = balance_bars(scene, room, world, n_found, entry)
+        if is_moved_pair(twists) or met != ZERO or lead != ZERO:
+            found = room.found[world, entry]
             rebound = launch.reports[world, t].rebound
-            bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar, vec3())
+            bar, by_twists = pull_pair(scene, room, world, lane, found, rebound, twists, met, lead)
             if lane == 0:
-                pull_touching(scene, room, bars, launch, world, t, found, bar)
+                add_pair(scene, room, world, found, bar, by_twists)
     if wp.static(PATCHES):
         for p in range(room.patches.count[world, 0]):
             touching = room.found[world, (n_found + p) * _LANES + lane]
-            twists_there = twists_of_pair(scene, room, world, touching)
+            twists_there = twists_of_pair(scene, room, world, (n_found + p) * _LANES + lane)
             if is_moved_pair(twists_there):
-                patch_bar = pull_patch(scene, room, bars, world, lane, touching, twists_there)
+                by = pull_patch(scene, room, world, lane, touching, twists_there)
                 if lane == 0:
-                    pull_touching(scene, room, bars, launch, world, t, touching, patch_bar)
+                    index = scene.pair_index[touching.pair]
+                    none = BodyState()
+                    add_to_body(scene, room, world, index.first, none, by.first, by.first_virtual)
+                    add_to_body(scene, room, world, index.second, none, by.second, by.second_virtual)
     wait()
-    if wp.static(TREES):
-        if lane == 0:
-            follow_chains(scene, room, launch, world, t)
-            pull_laws(scene, room, bars, world, t)
-            pull_loops(scene, room, bars, world)
-            pull_chains(scene, room, bars, launch, world, t)
-        wait()
+    if lane == 0:
+        if wp.static(TREES):
+            follow_chains(scene, room, world)
+            pull_laws(scene, room, world)
+            pull_loops(scene, room, world)
+            pull_chains(scene, room, world)
+        for i in range(n):
+            pull_body(scene, room, world, i)
+    wait()

@@ -1,78 +1,147 @@
 """Derivatives of patches: by the states of two bodies that touch, from a virtual work (docs/gradients.md).
 
-What only skips work, balls around samples and maps of where a density is positive, has none.
+First the work of the wrench of a patch along virtual velocities, from the sums over samples on; then what
+these ask of each sample's density, and of the poses of both bodies. What only skips work, balls around
+samples and maps of where a density is positive, has no derivatives.
 """
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import distance_work, Virtual
-from dano.engine.kernels.derivatives.contact import PairBar, summed_body
-from dano.engine.kernels.derivatives.pair_changes import add_density_changes, add_distance_changes
-from dano.engine.kernels.derivatives.patch_adjoint import (
-    cap_work,
-    gathered_work,
-    grid_work,
-    patch_work,
-    plane_work,
-    sample_work,
-    shell_work,
-    side_work,
-    view_work,
-)
-from dano.engine.kernels.derivatives.products import add_patch_material, add_to_leaf
+from dano.engine.kernels.derivatives.adjoint import Virtual
+from dano.engine.kernels.derivatives.contact import add_part, add_to_leaf, n_moving, pull_distance
 from dano.engine.kernels.lanes import total_of, wait
-from dano.engine.kernels.patch_tables import PatchSideIndex
-from dano.engine.kernels.patches import contact_of, frame_of, next_block, side_field, side_sign
-from dano.engine.kernels.tables import BLOCK, Changes, FoundPair, Room, Scene
+from dano.engine.kernels.patch_tables import PatchContact, PatchSideIndex, PatchTables
+from dano.engine.kernels.patches import contact_of, frame_of, next_block, side_field
+from dano.engine.kernels.tables import BLOCK, FoundPair, Given, GivenPatches, Room, Scene
 from dano.physics.features import KINDS, LANES
 from dano.physics.overlap import (
     added,
+    cap_patch,
     densest,
     DENSITY,
     Density,
     Field,
+    grid_density,
+    in_leaf,
     Patch,
+    patch_of,
+    plane_density,
+    sample_sums,
     seen_density,
+    shell_density,
     Sums,
     sums_in_world,
     View,
     view_of,
 )
-from dano.physics.pairs import BodyState
-from dano.physics.real import real, vec3, ZERO
-from dano.physics.solids.distances import leaf_distance
+from dano.physics.patch_law import patch_law
+from dano.physics.real import ONE, real, vec3, ZERO
+from dano.physics.solids.distances import leaf_distance, Solid
+from dano.physics.solids.grids import moved_kind, moved_solids
 from dano.physics.solids.kinds import HALF_SPACE, SPHERE
-from dano.physics.structures import sum_of
+from dano.physics.solids.leaves import Solids
+from dano.physics.structures import need_adjoints, product_of, sum_of, vjp_of
+from dano.physics.twists import relative_twist
+
+
+@wp.func
+def patch_of_sides(
+    given: Given,
+    patches: GivenPatches,
+    tables: PatchTables,
+    world: int,
+    contact: PatchContact,
+) -> Patch:
+    """The patch of a contact from the sums over the samples of its sides."""
+    patch = Patch()
+    whole = Sums()
+    is_cap = bool(False)
+    for k in range(2):
+        if k < contact.sides:
+            s = contact.first_side + k
+            index = tables.side_index[s]
+            sampled = frame_of(given.seen[world, index.sampled])
+            queried = frame_of(given.seen[world, index.queried])
+            mass = given.bodies[world, index.sampled].mass
+            sign = wp.where(index.sampled == contact.first, ONE, -ONE)
+            if index.ball >= 0:
+                if wp.static(SPHERE in KINDS and HALF_SPACE in KINDS):
+                    plane = tables.fields.kinds[index.first_part].first_leaf
+                    patch = cap_patch(
+                        patches.leaves[world, index.ball],
+                        patches.leaves[world, plane],
+                        sampled,
+                        queried,
+                        mass,
+                    )
+                    patch.normal = sign * patch.normal
+                    is_cap = True
+            else:
+                own = patches.sums[world, s]
+                if own.share > ZERO:
+                    mass = mass * patches.sides[world, s].density_scale
+                    whole = added(whole, sums_in_world(own, sampled, queried, mass, sign))
+    if not is_cap:
+        patch = patch_of(whole, ZERO)
+    return patch
+
+
+@wp.func
+def patch_work(
+    given: Given,
+    patches: GivenPatches,
+    tables: PatchTables,
+    world: int,
+    c: int,
+    twists: Virtual,
+) -> real:
+    """Work of the impulse of a patch along the virtual velocities of its bodies."""
+    contact = tables.contacts[c]
+    patch = patch_of_sides(given, patches, tables, world, contact)
+    first = given.seen[world, contact.first].position
+    apart = first - given.seen[world, contact.second].position
+    arm = patch.centroid - first
+    twist = relative_twist(twists.first, twists.second, apart)
+    virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
+    slip = twist.velocity + wp.cross(twist.spin, arm)
+    found = patch_law(patches.patch_materials[world, c], patch, contact.adhesive > 0, slip, twist.spin)
+    moved = virtual.velocity + wp.cross(virtual.spin, arm)
+    return given.timestep[world, 0] * (wp.dot(found.force, moved) + wp.dot(found.moment, virtual.spin))
+
+
+@wp.func
+def grid_at(solids: Solids, world: int, solid: Solid, x: vec3) -> Density:
+    """Density of a grid at a point."""
+    return grid_density(solids, world, solid.kind, solid.leaf, in_leaf(solid.leaf, x))
+
+
+@wp.func
+def view_at(
+    given: Given, patches: GivenPatches, world: int, sampled: int, queried: int, field: Field
+) -> View:
+    """A field as the samples of another body see it."""
+    solid = field.solid
+    solid.leaf = patches.leaves[world, field.solid.first]
+    own = field
+    own.solid = solid
+    return view_of(own, frame_of(given.seen[world, sampled]), frame_of(given.seen[world, queried]))
+
+
+sample_sums_work, plane_work, shell_work = map(vjp_of, (sample_sums, plane_density, shell_density))
+grid_work, view_work = vjp_of(grid_at), vjp_of(view_at)
+summed_view, total_view = sum_of(View), total_of(View)
+density_product = product_of(Density)
+
+for _function in (patch_work, sample_sums_work, plane_work, shell_work, grid_work, view_work):
+    need_adjoints(_function)
+
 
 _LANES, _BLOCK, _DENSITY = wp.constant(LANES), wp.constant(BLOCK), wp.constant(DENSITY)
-
-summed_view, total_view = sum_of(View), total_of(View)
-
-
-@wp.func
-def add_edge(bars: wp.ref[Changes], world: int, part: int, bar: real):
-    """Add a derivative by the width of a part's edge."""
-    if bars.parts.shape[1] > 0:
-        bars.parts[world, part].edge += bar
-
-
-@wp.func
-def add_mass(bars: wp.ref[Changes], world: int, body: int, bar: real):
-    """Add a derivative by a mass."""
-    if bars.bodies.shape[1] > 0:
-        bars.bodies[world, body].mass += bar
 
 
 @wp.func
 def pull_place(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    world: int,
-    lane: int,
-    field: Field,
-    x: vec3,
-    bar: Density,
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, field: Field, x: vec3, bar: Density
 ) -> vec3:
     """Derivative by a point in a field's frame from one by the density there; adds those by the field."""
     leading = densest(scene.solids, scene.patches.fields, world, field, x)
@@ -83,28 +152,28 @@ def pull_place(
         is_grid = solid.kind.kind == _DENSITY
         if is_grid:
             _a, _b, by_grid, by_place, _c = wp.grad(grid_work)(scene.solids, world, solid, x, bar)
-            add_to_leaf(bars.leaves, world, solid.first, by_grid.leaf)
-            add_density_changes(scene, room, world, lane, solid, x, bar)
+            add_to_leaf(room.bars.leaves, world, solid.first, by_grid.leaf)
+            for k in range(n_moving(scene, room)):
+                kind = moved_kind(scene.solids, solid.kind, k)
+                moved = moved_solids(scene.solids)
+                change = grid_density(moved, world, kind, solid.leaf, in_leaf(solid.leaf, x))
+                add_part(room, world, lane, k, density_product(bar, change))
             found = by_place
     if not is_grid:
         d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
         by_part, _d, by_solid, by_x, by_d, _e = wp.grad(shell_work)(
             leading.part, leading.kind, solid, x, d, bar
         )
-        _f, _g, by_leaf, of_x, _h = wp.grad(distance_work)(scene.solids, world, solid, x, by_d)
-        add_edge(bars, world, leading.first, by_part.edge)
-        add_to_leaf(bars.leaves, world, solid.first, by_solid.leaf)
-        add_to_leaf(bars.leaves, world, solid.first, by_leaf.leaf)
-        add_distance_changes(scene, room, world, lane, solid, x, by_d)
-        found = by_x + of_x
+        room.bars.parts[world, leading.first].edge += by_part.edge
+        add_to_leaf(room.bars.leaves, world, solid.first, by_solid.leaf)
+        found = by_x + pull_distance(scene, room, world, lane, solid, x, by_d)
     return found
 
 
 @wp.func
-def pull_samples(
+def pull_weighted(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
-    bars: wp.ref[Changes],
     world: int,
     lane: int,
     index: PatchSideIndex,
@@ -121,163 +190,69 @@ def pull_samples(
             sample = scene.patches.samples[world, s]
             density = seen_density(scene.solids, scene.patches.fields, world, field, view, sample.point)
             if density.value > ZERO:
-                by_sample, by_density, _a = wp.grad(sample_work)(sample, density, bar)
+                by_sample, by_density, _a = wp.grad(sample_sums_work)(sample, density, bar)
                 by_point = by_sample.point
                 if view.is_plane:
                     by_view, by_edge, of_point, _b = wp.grad(plane_work)(
                         view, field.part.edge, sample.point, by_density
                     )
-                    add_edge(bars, world, field.first, by_edge)
+                    room.bars.parts[world, field.first].edge += by_edge
                     found = summed_view(found, by_view)
                     by_point += of_point
                 else:
                     # x = rotation · point + origin
                     x = view.rotation * sample.point + view.origin
-                    by_x = pull_place(scene, room, bars, world, lane, field, x, by_density)
+                    by_x = pull_place(scene, room, world, lane, field, x, by_density)
                     found.rotation += wp.outer(by_x, sample.point)
                     found.origin += by_x
                     by_point += wp.transpose(view.rotation) * by_x
-                if bars.weighted.shape[1] > 0:
-                    bars.weighted[world, s].point += by_point
-                    bars.weighted[world, s].weight += by_sample.weight
+                if room.bars.weighted.shape[1] > 0:
+                    room.bars.weighted[world, s].point += by_point
+                    room.bars.weighted[world, s].weight += by_sample.weight
         i = next_block(scene, world, index, field, view, i + _LANES)
     return total_view(found)
 
 
 @wp.func
-def add_side(bar: PairBar, is_first: bool, sampled: BodyState, queried: BodyState) -> PairBar:
-    """Add derivatives by the states of the bodies of a side."""
-    if is_first:
-        bar.first = summed_body(bar.first, sampled)
-        bar.second = summed_body(bar.second, queried)
-    else:
-        bar.first = summed_body(bar.first, queried)
-        bar.second = summed_body(bar.second, sampled)
-    return bar
-
-
-@wp.func
-def pull_cap(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    world: int,
-    lane: int,
-    c: int,
-    s: int,
-    patch_bar: Patch,
-    bar: PairBar,
-) -> PairBar:
-    """Add derivatives through the overlap of a ball with a half-space."""
+def pull_side(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, s: int):
+    """Add derivatives through the samples of a side."""
     index = scene.patches.side_index[s]
-    plane = side_field(scene, world, index).solid
-    sign = side_sign(scene, c, index)
-    by_ball, by_plane, by_sampled, by_queried, by_mass, _a, _b = wp.grad(cap_work)(
-        scene.solids.leaves[world, index.ball],
-        plane.leaf,
-        room.bodies[world, index.sampled],
-        room.bodies[world, index.queried],
-        scene.bodies[world, index.sampled].mass,
-        sign,
-        patch_bar,
-    )
-    if lane == 0:
-        add_to_leaf(bars.leaves, world, index.ball, by_ball)
-        add_to_leaf(bars.leaves, world, plane.first, by_plane)
-        add_mass(bars, world, index.sampled, by_mass)
-    return add_side(bar, sign > ZERO, by_sampled, by_queried)
-
-
-@wp.func
-def pull_side(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    world: int,
-    lane: int,
-    c: int,
-    s: int,
-    sums_bar: Sums,
-    bar: PairBar,
-) -> PairBar:
-    """Add derivatives through the sums over the samples of a side."""
-    side = scene.patches.sides[world, s]
-    index = scene.patches.side_index[s]
-    a = room.bodies[world, index.sampled]
-    b = room.bodies[world, index.queried]
     field = side_field(scene, world, index)
-    sign = side_sign(scene, c, index)
-    mass = scene.bodies[world, index.sampled].mass
-    by_own, by_sampled, by_queried, by_mass, by_scale, _a, _b = wp.grad(side_work)(
-        room.patches.sums[world, s], a, b, mass, side.density_scale, sign, sums_bar
-    )
-    view = view_of(field, frame_of(a), frame_of(b))
-    by_view = pull_samples(scene, room, bars, world, lane, index, field, view, by_own)
-    by_field, of_sampled, of_queried, _c = wp.grad(view_work)(field, a, b, by_view)
+    sampled = frame_of(room.bodies[world, index.sampled])
+    view = view_of(field, sampled, frame_of(room.bodies[world, index.queried]))
+    by_view = pull_weighted(scene, room, world, lane, index, field, view, room.patches.sum_bars[world, s])
     if lane == 0:
-        add_to_leaf(bars.leaves, world, field.solid.first, by_field.solid.leaf)
-        add_mass(bars, world, index.sampled, by_mass)
-        if bars.sides.shape[1] > 0:
-            bars.sides[world, s].density_scale += by_scale
-    bar = add_side(bar, sign > ZERO, by_sampled, by_queried)
-    return add_side(bar, sign > ZERO, of_sampled, of_queried)
-
-
-@wp.func
-def summed_sides(scene: wp.ref[Scene], room: wp.ref[Room], world: int, c: int) -> Sums:
-    """Sums over the samples of both sides of a contact, in the world."""
-    contact = scene.patches.contacts[c]
-    sums = Sums()
-    for s in range(contact.first_side, contact.first_side + contact.sides):
-        index = scene.patches.side_index[s]
-        sampled = frame_of(room.bodies[world, index.sampled])
-        queried = frame_of(room.bodies[world, index.queried])
-        mass = scene.bodies[world, index.sampled].mass * scene.patches.sides[world, s].density_scale
-        own = room.patches.sums[world, s]
-        if own.share > ZERO:
-            sums = added(sums, sums_in_world(own, sampled, queried, mass, side_sign(scene, c, index)))
-    return sums
+        _a, _b, _c, _d, _e, _f, _g = wp.grad(view_work)(
+            room.given,
+            room.given_patches,
+            world,
+            index.sampled,
+            index.queried,
+            field,
+            by_view,
+        )
 
 
 @wp.func
 def pull_patch(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    world: int,
-    lane: int,
-    found: FoundPair,
-    twists: Virtual,
-) -> PairBar:
-    """Derivatives by the states of the bodies of a patch that touches; adds those by all that is constant."""
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, found: FoundPair, twists: Virtual
+) -> Virtual:
+    """Derivatives by the twists of the bodies of a patch, for the first lane; adds all others."""
     c = contact_of(scene, found)
     contact = scene.patches.contacts[c]
-    a = room.bodies[world, contact.first]
-    b = room.bodies[world, contact.second]
-    by_material, by_patch, _a, by_first, by_second, by_h, by_twists = wp.grad(patch_work)(
-        scene.patches.materials[world, c],
-        room.patches.patches[world, c],
-        contact.adhesive > 0,
-        a.position,
-        b.position,
-        scene.timestep[world, 0],
-        twists,
-    )
+    bar = Virtual()
     if lane == 0:
-        add_patch_material(bars.patch_materials, world, c, by_material)
-    bar = PairBar()
-    bar.first.position = by_first
-    bar.second.position = by_second
-    bar.timestep = by_h
-    bar.twists = by_twists
-    by_sums, _b, _c = wp.grad(gathered_work)(summed_sides(scene, room, world, c), ZERO, by_patch)
+        for s in range(contact.first_side, contact.first_side + contact.sides):
+            room.patches.sum_bars[world, s] = Sums()
+        _a, _b, _c, _d, _e, by_twists = wp.grad(patch_work)(
+            room.given, room.given_patches, scene.patches, world, c, twists
+        )
+        bar = by_twists
+    wait()
     s = int(contact.first_side)
     while s < contact.first_side + contact.sides:
-        if scene.patches.side_index[s].ball >= 0:
-            if wp.static(SPHERE in KINDS and HALF_SPACE in KINDS):
-                bar = pull_cap(scene, room, bars, world, lane, c, s, by_patch, bar)
-        elif room.patches.sums[world, s].share > ZERO:
-            bar = pull_side(scene, room, bars, world, lane, c, s, by_sums, bar)
+        if scene.patches.side_index[s].ball < 0 and room.patches.sums[world, s].share > ZERO:
+            pull_side(scene, room, world, lane, s)
         s += 1
     wait()
     return bar

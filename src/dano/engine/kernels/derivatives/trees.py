@@ -1,399 +1,290 @@
-"""Derivatives of bodies on joints: sweeps from the tips of trees to their roots (docs/gradients.md)."""
+"""Derivatives of bodies on joints: sweeps from the tips of trees to their roots (docs/gradients.md).
+
+A body on a joint stands and moves as the body that carries it says: each joint is a function from one `Chain`
+to the next, and derivatives go through it from the tips to the roots. What is differentiated stands
+first: see `dano.engine.kernels.derivatives.adjoint`.
+"""
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.products import add_joint, add_law, add_loop, add_row
-from dano.engine.kernels.derivatives.tree_adjoint import (
-    ball_work,
-    coordinate_work,
-    hanging_body_work,
-    hanging_chain,
-    hanging_work,
-    JointSpeeds,
-    loop_work,
-    placing_work,
-    root_chain,
-    root_work,
-)
-from dano.engine.kernels.rollout import Launch, push_of, row_before
-from dano.engine.kernels.tables import Changes, Room, Scene, StateRow
+from dano.engine.kernels.derivatives.adjoint import momentum_gained
+from dano.engine.kernels.rollout import Launch
+from dano.engine.kernels.tables import Given, GivenTrees, Room, Scene, StateRow
 from dano.engine.kernels.trees.kinematics import unknown_of, velocities_of
 from dano.engine.kernels.trees.loops import forces_of
-from dano.engine.kernels.trees.tables import Chain, HangingBar, Node
+from dano.engine.kernels.trees.tables import Chain, Coordinate, HangingBar, LoopIndex, Node
 from dano.physics.pairs import BodyState
-from dano.physics.real import ONE, quat, real, vec3, vec6, ZERO
-from dano.physics.rotations import from_wxyz, to_wxyz
-from dano.physics.trees.joints import BALL, Carrier, ROOT
+from dano.physics.real import ONE, quat, real, vec3, vec4, vec6, ZERO
+from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turn_of_step
+from dano.physics.structures import need_adjoints, vjp_of
+from dano.physics.trees.joint_laws import joint_momentum, joint_ramps, JointDrive, ramps_force
+from dano.physics.trees.joints import (
+    BALL,
+    ball_after,
+    Carrier,
+    displacement_twist,
+    hanging_move,
+    hanging_pose,
+    motion_direction,
+    motion_share,
+    motion_twist,
+    orientation_after,
+    ROOT,
+)
+from dano.physics.trees.loops import gap_by_twist, loop_gap, LoopEnd
+from dano.physics.twists import angular_part, joined, linear_part, twist_at
 
-_BALL, _ROOT = wp.constant(BALL), wp.constant(ROOT)
 # Efforts that bound nothing [N m or N]: zero times them is zero, as zero times infinity is not.
 _ENDLESS = wp.constant(real(1e30))
 
 
 @wp.func
-def com_of(scene: wp.ref[Scene], world: int, body: int) -> vec3:
+def com_of(given: Given, world: int, body: int) -> vec3:
     """Centre of mass of a body [m, F]; zero of the world, −1."""
     if body < 0:
         return vec3()
-    return scene.bodies[world, body].com
+    return given.bodies[world, body].com
 
 
 @wp.func
-def chain_of(room: wp.ref[Room], world: int, node: int, body: int) -> Chain:
+def chain_of(given: Given, trees: GivenTrees, world: int, node: int, body: int) -> Chain:
     """How a node's body stands and moves; for no node how a body, or −1 for the world, stands still."""
     if node >= 0:
-        return room.trees.chains[world, node]
+        return trees.chains[world, node]
     still = Chain()
     still.orientation = quat(ZERO, ZERO, ZERO, ONE)
     still.before.turn = still.orientation
     still.after.turn = still.orientation
     if body >= 0:
-        still.position = room.bodies[world, body].position
-        still.orientation = room.bodies[world, body].orientation
+        row = given.state[world, body]
+        still.position = row.position
+        still.orientation = from_wxyz(row.orientation)
     return still
 
 
 @wp.func
-def speeds_of(room: wp.ref[Room], world: int, node: Node) -> JointSpeeds:
-    """Velocities of a joint's coordinates."""
-    speeds = JointSpeeds()
-    speeds.before = velocities_of(room.old, world, node)
-    speeds.after = velocities_of(room.velocity, world, node)
-    speeds.work = velocities_of(room.step, world, node)
-    return speeds
+def coordinate_of(values: wp.array2d(dtype=real), world: int, node: Node, part: int) -> real:
+    """A number of a coordinate of a joint; zero where it has fewer."""
+    if part >= node.width:
+        return ZERO
+    return values[world, node.coordinate + part]
 
 
 @wp.func
-def coordinates_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, node: Node) -> vec3:
-    """Coordinates of a joint at the start of the step, as many as it has."""
-    q = vec3()
-    for part in range(node.width):
-        q[part] = room.trees.joints[world, node.coordinate + part].drive.q
-    return q
-
-
-@wp.func
-def follow_chains(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, t: int):
-    """How bodies on trees move at the end of a step, and with the virtual velocities in `room.step`."""
-    h = scene.timestep[world, 0]
-    for n in range(scene.trees.nodes.shape[0]):
-        node = scene.trees.nodes[n]
-        if node.alone == 0:
-            if node.kind == _ROOT:
-                b = node.place // 6
-                row = row_before(scene, launch, world, t, node.body)
-                origin = room.bodies[world, node.origin].position
-                room.trees.chains[world, n] = root_chain(
-                    row, room.velocity[world, b], room.step[world, b], origin, h
-                )
-            else:
-                room.trees.chains[world, n] = hanging_chain(
-                    node.kind,
-                    scene.trees.joints[world, node.joint],
-                    chain_of(room, world, node.parent, node.carrier),
-                    com_of(scene, world, node.carrier),
-                    com_of(scene, world, node.body),
-                    coordinates_of(scene, room, world, node),
-                    speeds_of(room, world, node),
-                    room.bodies[world, node.origin].position,
-                    h,
-                )
-
-
-@wp.func
-def add_place(bars: wp.array2d(dtype=StateRow), world: int, body: int, position: vec3, orientation: quat):
-    """Add a derivative by the pose of a body that no joint moves; −1 for the world."""
-    if body >= 0:
-        bars[world, body].position += position
-        bars[world, body].orientation += to_wxyz(orientation)
-
-
-@wp.func
-def add_chain(scene: wp.ref[Scene], room: wp.ref[Room], world: int, node: int, body: int, bar: Chain):
-    """Add a derivative by how a body stands and moves, see `chain_of`."""
-    if node >= 0:
-        sums = room.trees.chain_bars[world, node]
-        sums.position += bar.position
-        sums.orientation = sums.orientation + bar.orientation
-        sums.before.turn = sums.before.turn + bar.before.turn
-        sums.before.shift += bar.before.shift
-        sums.after.turn = sums.after.turn + bar.after.turn
-        sums.after.shift += bar.after.shift
-        sums.change += bar.change
-        sums.work += bar.work
-        room.trees.chain_bars[world, node] = sums
-        room.trees.asked[world, node] = 1
-    else:
-        add_place(room.state_bar, world, body, bar.position, bar.orientation)
-
-
-@wp.func
-def add_com(bars: wp.ref[Changes], world: int, body: int, bar: vec3):
-    """Add a derivative by a centre of mass; −1 for the world."""
-    if body >= 0 and bars.bodies.shape[1] > 0:
-        bars.bodies[world, body].com += bar
-
-
-@wp.func
-def add_timestep(bars: wp.ref[Changes], world: int, bar: real):
-    """Add a derivative by h."""
-    if bars.timestep.shape[1] > 0:
-        bars.timestep[world, 0] += bar
-
-
-@wp.func
-def add_unknowns(values: wp.array2d(dtype=vec6), world: int, node: Node, bar: vec3):
-    """Add derivatives by a joint's velocities."""
-    for part in range(node.width):
-        u = node.place + part
-        values[world, u // 6][u % 6] += bar[part]
-
-
-@wp.func
-def add_coordinates(values: wp.array2d(dtype=real), world: int, node: Node, bar: vec3):
-    """Add derivatives by a joint's coordinates, or by their old velocities."""
-    for part in range(node.width):
-        c = node.coordinate + part
-        values[world, c] = values[world, c] + bar[part]
-
-
-@wp.func
-def add_hanging(room: wp.ref[Room], world: int, node: int, state: BodyState, twist: vec6, work: vec6):
-    """Add derivatives by how contact sees a body on a joint."""
-    sums = room.trees.hanging_bars[world, node]
-    sums.state.position += state.position
-    sums.state.orientation = sums.state.orientation + state.orientation
-    sums.state.ahead = sums.state.ahead + state.ahead
-    sums.state.velocity += state.velocity
-    sums.state.spin += state.spin
-    sums.state.com += state.com
-    sums.twist += twist
-    sums.work += work
-    room.trees.hanging_bars[world, node] = sums
-    room.trees.asked[world, node] = 1
-
-
-@wp.func
-def pull_hanging(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    launch: wp.ref[Launch],
-    world: int,
-    t: int,
-    n: int,
-):
-    """Add derivatives through a body on a joint and its joint, to what carries it."""
-    h = scene.timestep[world, 0]
-    node = scene.trees.nodes[n]
-    i = node.body
-    push = push_of(scene, launch, world, t, i)
-    origin = room.bodies[world, node.origin].position
-    by_body, by_row, by_push, by_gravity, by_h, by_chain, _a, _b = wp.grad(hanging_body_work)(
-        scene.bodies[world, i],
-        row_before(scene, launch, world, t, i),
-        push,
-        scene.gravity[world, 0],
-        h,
-        room.trees.chains[world, n],
-        origin,
-        room.trees.hanging_bars[world, n],
+def coordinates_of(values: wp.array2d(dtype=real), world: int, node: Node) -> vec3:
+    """Numbers of a joint's coordinates."""
+    return vec3(
+        coordinate_of(values, world, node, 0),
+        coordinate_of(values, world, node, 1),
+        coordinate_of(values, world, node, 2),
     )
-    add_row(room.state_bar, world, i, by_row)
-    if bars.bodies.shape[1] > 0:
-        bars.bodies[world, i].mass += by_body.mass
-        bars.bodies[world, i].inertia += by_body.inertia
-    if bars.pushes.shape[1] > 0:
-        bars.pushes[world, t * scene.body_index.shape[0] + i] = by_push
-    if bars.gravity.shape[1] > 0:
-        bars.gravity[world, 0] += by_gravity
-    add_chain(scene, room, world, n, i, by_chain)
-    _c, by_joint, by_parent, by_parent_com, by_com, by_q, by_speeds, _d, of_h, _e = wp.grad(hanging_work)(
-        node.kind,
-        scene.trees.joints[world, node.joint],
-        chain_of(room, world, node.parent, node.carrier),
-        com_of(scene, world, node.carrier),
-        com_of(scene, world, i),
-        coordinates_of(scene, room, world, node),
-        speeds_of(room, world, node),
-        origin,
-        h,
-        room.trees.chain_bars[world, n],
-    )
-    add_joint(bars.joints, world, node.joint, by_joint)
-    add_com(bars, world, node.carrier, by_parent_com)
-    add_com(bars, world, i, by_com + by_body.com)
-    add_timestep(bars, world, by_h + of_h)
-    add_chain(scene, room, world, node.parent, node.carrier, by_parent)
-    add_coordinates(room.trees.q_bar, world, node, by_q)
-    add_coordinates(room.trees.v_bar, world, node, by_speeds.before)
-    add_unknowns(room.residual, world, node, by_speeds.after)
 
 
 @wp.func
-def pull_chains(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    launch: wp.ref[Launch],
-    world: int,
-    t: int,
-):
-    """Add derivatives through how bodies of trees stand and move, which are used up.
+def root_chain(given: Given, world: int, body: int, y: vec6, virtual: vec6, origin: vec3) -> Chain:
+    """Of a body that moves freely; its velocities are taken at its centre of mass, wherever that is."""
+    found = Chain()
+    row = given.state[world, body]
+    h = given.timestep[world, 0]
+    q = from_wxyz(row.orientation)
+    spin = matrix(q) * row.omega
+    found.position = row.position
+    found.orientation = q
+    found.before.turn = turn_of_step(spin, h)
+    found.before.shift = h * row.velocity
+    found.after.turn = turn_of_step(angular_part(y), h)
+    found.after.shift = h * linear_part(y)
+    lever = origin - row.position
+    found.change = twist_at(y - joined(row.velocity, spin), lever)
+    found.work = twist_at(virtual, lever)
+    return found
 
-    Those by velocities at the end are added to `room.residual`.
+
+@wp.func
+def hanging_chain(
+    given: Given,
+    trees: GivenTrees,
+    world: int,
+    node: Node,
+    y: vec3,
+    virtual: vec3,
+    origin: vec3,
+) -> Chain:
+    """Of a body on a joint, with velocities y of its coordinates at the end [rad/s or m/s].
+
+    `origin` is that of the tree [m, W]: sums of works do not depend on it.
     """
-    h = scene.timestep[world, 0]
-    m = scene.trees.nodes.shape[0]
-    for k in range(m):
-        n = m - 1 - k
-        node = scene.trees.nodes[n]
-        work = room.trees.chains[world, n].work
-        if node.alone == 0 and (room.trees.asked[world, n] > 0 or not (wp.length_sq(work) == ZERO)):
-            if node.kind == _ROOT:
-                b = node.place // 6
-                row = row_before(scene, launch, world, t, node.body)
-                by_row, by_velocity, _a, _b, by_h, _c = wp.grad(root_work)(
-                    row,
-                    room.velocity[world, b],
-                    room.step[world, b],
-                    room.bodies[world, node.origin].position,
-                    h,
-                    room.trees.chain_bars[world, n],
-                )
-                add_row(room.state_bar, world, node.body, by_row)
-                room.residual[world, b] = room.residual[world, b] + by_velocity
-                add_timestep(bars, world, by_h)
-            else:
-                pull_hanging(scene, room, bars, launch, world, t, n)
-            room.trees.chain_bars[world, n] = Chain()
-            room.trees.hanging_bars[world, n] = HangingBar()
-            room.trees.asked[world, n] = 0
-
-
-@wp.func
-def carrier_after(scene: wp.ref[Scene], launch: wp.ref[Launch], world: int, t: int, body: int) -> Carrier:
-    """What a joint hangs on at the end of a step."""
+    found = Chain()
+    h = given.timestep[world, 0]
+    kind = node.kind
+    joint = trees.joints[world, node.joint]
+    parent = chain_of(given, trees, world, node.parent, node.carrier)
+    old = coordinates_of(trees.v, world, node)
     carrier = Carrier()
-    carrier.orientation = quat(ZERO, ZERO, ZERO, ONE)
-    if body >= 0:
-        row = launch.states[world, t * scene.body_index.shape[0] + body]
-        carrier.position = row.position
-        carrier.orientation = from_wxyz(row.orientation)
-        carrier.com = scene.bodies[world, body].com
-    return carrier
+    carrier.position = parent.position
+    carrier.orientation = parent.orientation
+    carrier.com = com_of(given, world, node.carrier)
+    com = com_of(given, world, node.body)
+    pose = hanging_pose(kind, joint, carrier, com, coordinates_of(trees.q, world, node))
+    frame = pose.frame
+    share = motion_share(kind, joint)
+    arm = frame.pivot - parent.position
+    lever = pose.position - frame.pivot
+    before = hanging_move(kind, joint, frame, parent.before, arm, lever, old, h)
+    after = hanging_move(kind, joint, frame, parent.after, arm, lever, y, h)
+    found.position = pose.position
+    found.orientation = pose.orientation
+    found.before = before.displacement
+    found.after = after.displacement
+    found.change = parent.change
+    found.work = parent.work
+    for part in range(3):
+        along = share * motion_direction(kind, frame, part)
+        motion = motion_twist(kind, joint, part, along, frame.pivot - origin)
+        found.change += (y[part] - old[part]) * motion
+        found.work += virtual[part] * motion
+    return found
 
 
 @wp.func
-def pull_places(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    bars: wp.ref[Changes],
-    launch: wp.ref[Launch],
+def hanging_body_work(
+    given: Given,
+    trees: GivenTrees,
     world: int,
-    t: int,
-):
-    """Add derivatives through poses of bodies on joints at a step's end, to `after_bar` and `q_after`."""
-    m = scene.trees.nodes.shape[0]
-    for k in range(m):
-        n = m - 1 - k
-        node = scene.trees.nodes[n]
-        asked = room.after_bar[world, node.body]
-        size = wp.length_sq(asked.position) + wp.length_sq(asked.orientation)
-        if node.kind != _ROOT and not (size == ZERO):
-            q = vec3()
-            for part in range(node.width):
-                q[part] = launch.qs[world, t * scene.trees.coordinates.shape[0] + node.coordinate + part]
-            _a, by_joint, by_carrier, by_com, by_q, _b, _c = wp.grad(placing_work)(
-                node.kind,
-                scene.trees.joints[world, node.joint],
-                carrier_after(scene, launch, world, t, node.carrier),
-                com_of(scene, world, node.body),
-                q,
-                asked.position,
-                asked.orientation,
-            )
-            add_joint(bars.joints, world, node.joint, by_joint)
-            add_place(room.after_bar, world, node.carrier, by_carrier.position, by_carrier.orientation)
-            add_com(bars, world, node.carrier, by_carrier.com)
-            add_com(bars, world, node.body, by_com)
-            add_coordinates(room.trees.q_after, world, node, by_q)
+    n: int,
+    i: int,
+    origin: vec3,
+    bar: HangingBar,
+    state_bar: BodyState,
+) -> real:
+    """Work of what a body's momentum gains, and ⟨bars, what contact and the end of the step ask of it⟩."""
+    chain = trees.chains[world, n]
+    h = given.timestep[world, 0]
+    row = given.state[world, i]
+    lever = chain.position - origin
+    virtual = twist_at(chain.work, lever)
+    twist = displacement_twist(chain.after, h)
+    came = displacement_twist(chain.before, h)
+    stands = StateRow()
+    stands.orientation = to_wxyz(chain.orientation)
+    stands.velocity = row.velocity
+    stands.omega = row.omega
+    total = wp.dot(momentum_gained(given, world, i, stands, ZERO, ONE, twist), virtual)
+    ahead = orientation_after(chain.before, chain.orientation)
+    total += wp.dot(state_bar.position, chain.position) + wp.dot(state_bar.orientation, chain.orientation)
+    total += wp.dot(state_bar.ahead, ahead) + wp.dot(state_bar.com, com_of(given, world, i))
+    total += wp.dot(state_bar.velocity, linear_part(came)) + wp.dot(state_bar.spin, angular_part(came))
+    total += wp.dot(bar.twist, came + twist_at(chain.change, lever)) + wp.dot(bar.work, virtual)
+    omega = wp.quat_rotate_inv(chain.orientation, angular_part(twist))
+    return total + wp.dot(bar.velocity, linear_part(twist)) + wp.dot(bar.omega, omega)
 
 
 @wp.func
-def pull_coordinates(scene: wp.ref[Scene], room: wp.ref[Room], bars: wp.ref[Changes], world: int):
-    """Derivatives through joint coordinates at the end of a step, q⁺ = q + h y, and their velocities."""
-    h = scene.timestep[world, 0]
-    for c in range(scene.trees.coordinates.shape[0]):
-        room.trees.q_bar[world, c] = ZERO
-        room.trees.v_bar[world, c] = ZERO
-    for n in range(scene.trees.nodes.shape[0]):
-        node = scene.trees.nodes[n]
-        if node.kind == _BALL:
-            bar = vec3()
-            for part in range(3):
-                bar[part] = room.trees.q_after[world, node.coordinate + part]
-                room.trees.q_after[world, node.coordinate + part] = ZERO
-            q = coordinates_of(scene, room, world, node)
-            by_q, by_y, by_h, _a = wp.grad(ball_work)(q, velocities_of(room.velocity, world, node), h, bar)
-            add_coordinates(room.trees.q_bar, world, node, by_q)
-            add_unknowns(room.residual, world, node, by_y)
-            add_timestep(bars, world, by_h)
-    for c in range(scene.trees.coordinates.shape[0]):
-        u = scene.trees.coordinates[c].place
-        bar_q = room.trees.q_after[world, c]
-        room.trees.q_bar[world, c] = room.trees.q_bar[world, c] + bar_q
-        room.residual[world, u // 6][u % 6] += h * bar_q + room.trees.v_after[world, c]
-        add_timestep(bars, world, bar_q * unknown_of(room.velocity, world, u))
+def placing_work(
+    given: Given,
+    trees: GivenTrees,
+    world: int,
+    node: Node,
+    carrier: Carrier,
+    q: vec3,
+    position: vec3,
+    orientation: vec4,
+) -> real:
+    """⟨bars, pose of a body on a joint⟩; its carrier is without its centre of mass."""
+    carries = carrier
+    carries.com = com_of(given, world, node.carrier)
+    com = com_of(given, world, node.body)
+    pose = hanging_pose(node.kind, trees.joints[world, node.joint], carries, com, q)
+    return wp.dot(position, pose.position) + wp.dot(orientation, to_wxyz(pose.orientation))
 
 
 @wp.func
-def ask_of_end(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
-    """Derivatives by the velocities of bodies on joints at the end of a step as those of `pull_chains`."""
-    for n in range(scene.trees.nodes.shape[0]):
-        node = scene.trees.nodes[n]
-        bar = HangingBar()
-        if node.kind != _ROOT:
-            bar.velocity = room.after_bar[world, node.body].velocity
-            bar.omega = room.after_bar[world, node.body].omega
-            room.state_bar[world, node.body] = StateRow()
-        room.trees.hanging_bars[world, n] = bar
-        room.trees.chain_bars[world, n] = Chain()
-        size = wp.length_sq(bar.velocity) + wp.length_sq(bar.omega)
-        room.trees.asked[world, n] = wp.where(size == ZERO, 0, 1)
+def ball_coordinates_after(given: Given, trees: GivenTrees, world: int, node: Node, y: vec3) -> vec3:
+    """Coordinates of a ball joint at the end of a step."""
+    return ball_after(coordinates_of(trees.q, world, node), y, given.timestep[world, 0])
+
+
+root_work, hanging_work = vjp_of(root_chain), vjp_of(hanging_chain)
+ball_work = vjp_of(ball_coordinates_after)
 
 
 @wp.func
-def pull_laws(scene: wp.ref[Scene], room: wp.ref[Room], bars: wp.ref[Changes], world: int, t: int):
-    """Add derivatives through what acts on joint coordinates."""
-    h = scene.timestep[world, 0]
-    k = scene.trees.coordinates.shape[0]
-    for c in range(k):
-        coordinate = scene.trees.coordinates[c]
-        virtual = unknown_of(room.step, world, coordinate.place)
-        if virtual == ZERO:
-            continue
-        state = room.trees.joints[world, c]
-        law = scene.trees.laws[world, c]
-        law.least_effort = wp.max(law.least_effort, -_ENDLESS)
-        law.most_effort = wp.min(law.most_effort, _ENDLESS)
-        by_law, by_drive, by_h, _a, _b, _c, _d = wp.grad(coordinate_work)(
-            law,
-            state.drive,
-            h,
-            unknown_of(room.velocity, world, coordinate.place),
-            h * state.rho,
-            coordinate.nonsmooth > 0,
-            virtual,
-        )
-        room.trees.q_bar[world, c] = room.trees.q_bar[world, c] + by_drive.q
-        room.trees.v_bar[world, c] = room.trees.v_bar[world, c] + by_drive.v
-        add_timestep(bars, world, by_h)
-        if bars.efforts.shape[1] > 0:
-            bars.efforts[world, t * k + c] = by_drive.effort
-        if bars.commands.shape[1] > 0:
-            bars.commands[world, t * k + c] = by_drive.command
-        add_law(bars.laws, world, c, by_law)
+def coordinate_work(
+    given: Given,
+    trees: GivenTrees,
+    world: int,
+    c: int,
+    coordinate: Coordinate,
+    y: real,
+    mass: real,
+    virtual: real,
+) -> real:
+    """Work of what acts on a coordinate along minus its virtual velocity."""
+    law = trees.laws[world, c]
+    h = given.timestep[world, 0]
+    law.least_effort = wp.max(law.least_effort, -_ENDLESS)
+    law.most_effort = wp.min(law.most_effort, _ENDLESS)
+    drive = JointDrive()
+    drive.q = trees.q[world, c]
+    drive.v = trees.v[world, c]
+    drive.effort = trees.efforts[world, c]
+    drive.command = trees.commands[world, c]
+    drive.constant = coordinate.constant > 0
+    momentum = joint_momentum(law, drive, h, y)
+    if coordinate.nonsmooth > 0:
+        momentum += h * ramps_force(joint_ramps(law, drive, h, mass), y)
+    return -virtual * momentum
+
+
+@wp.func
+def loop_end(chain: Chain) -> LoopEnd:
+    """An end of a loop at the start of a step."""
+    end = LoopEnd()
+    end.position = chain.position
+    end.orientation = chain.orientation
+    return end
+
+
+@wp.func
+def loop_end_after(chain: Chain) -> LoopEnd:
+    """… at its end."""
+    end = LoopEnd()
+    end.position = chain.position + chain.after.shift
+    end.orientation = chain.after.turn * chain.orientation
+    return end
+
+
+@wp.func
+def loop_work(
+    given: Given,
+    trees: GivenTrees,
+    world: int,
+    row: int,
+    index: LoopIndex,
+    first_origin: vec3,
+    second_origin: vec3,
+    forces: vec6,
+    virtual: vec6,
+) -> real:
+    """Work of the forces in a loop, and of its gap along minus virtual ones."""
+    loop = trees.loops[world, row]
+    first = chain_of(given, trees, world, index.first, index.first_body)
+    second = chain_of(given, trees, world, index.second, index.second_body)
+    one = loop_end(first)
+    other = loop_end(second)
+    moved = gap_by_twist(loop, one, one, twist_at(first.work, first.position - first_origin), False)
+    moved += gap_by_twist(loop, one, other, twist_at(second.work, second.position - second_origin), True)
+    gap = loop_gap(loop, loop_end_after(first), loop_end_after(second))
+    return given.timestep[world, 0] * wp.dot(forces, moved) - wp.dot(virtual, gap)
+
+
+for _function in (
+    root_work, hanging_work, hanging_body_work, placing_work, ball_work, coordinate_work, loop_work
+):  # fmt: skip
+    need_adjoints(_function)
+
+
+_BALL, _ROOT = wp.constant(BALL), wp.constant(ROOT)
 
 
 @wp.func
@@ -405,25 +296,199 @@ def origin_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, node: int) -
 
 
 @wp.func
-def pull_loops(scene: wp.ref[Scene], room: wp.ref[Room], bars: wp.ref[Changes], world: int):
-    """Add derivatives through the loops."""
+def follow_chains(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
+    """How bodies on trees move at the end of a step, and with the virtual velocities in `room.step`."""
+    for n in range(scene.trees.nodes.shape[0]):
+        node = scene.trees.nodes[n]
+        origin = origin_of(scene, room, world, n)
+        if node.alone == 0:
+            if node.kind == _ROOT:
+                b = node.place // 6
+                room.trees.chains[world, n] = root_chain(
+                    room.given, world, node.body, room.velocity[world, b], room.step[world, b], origin
+                )
+            else:
+                y = velocities_of(room.velocity, world, node)
+                virtual = velocities_of(room.step, world, node)
+                room.trees.chains[world, n] = hanging_chain(
+                    room.given, room.given_trees, world, node, y, virtual, origin
+                )
+
+
+@wp.func
+def ask(room: wp.ref[Room], world: int, node: int):
+    """Say that something is asked of a node's body; −1 for none."""
+    if node >= 0:
+        room.trees.asked[world, node] = 1
+
+
+@wp.func
+def add_unknowns(values: wp.array2d(dtype=vec6), world: int, node: Node, bar: vec3):
+    """Add derivatives by a joint's velocities."""
+    for part in range(node.width):
+        u = node.place + part
+        values[world, u // 6][u % 6] += bar[part]
+
+
+@wp.func
+def add_hanging(room: wp.ref[Room], world: int, node: int, twist: vec6, work: vec6):
+    """Add derivatives by the twists of a body on a joint, of which contact asks something."""
+    room.trees.hanging_bars[world, node].twist += twist
+    room.trees.hanging_bars[world, node].work += work
+    ask(room, world, node)
+
+
+@wp.func
+def pull_hanging(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n: int):
+    """Add derivatives through a body on a joint and its joint, to what carries it."""
+    node = scene.trees.nodes[n]
+    origin = room.bodies[world, node.origin].position
+    _z, _a, _b, _c, _d, _e, _f, _g = wp.grad(hanging_body_work)(
+        room.given, room.given_trees, world, n, node.body, origin, room.trees.hanging_bars[world, n],
+        room.body_bars[world, node.body],
+    )  # fmt: skip
+    y = velocities_of(room.velocity, world, node)
+    virtual = velocities_of(room.step, world, node)
+    _z, _i, _j, _k, by_y, _m, _n, _o = wp.grad(hanging_work)(
+        room.given, room.given_trees, world, node, y, virtual, origin, room.trees.chain_bars[world, n]
+    )
+    add_unknowns(room.residual, world, node, by_y)
+    ask(room, world, node.parent)
+
+
+@wp.func
+def pull_chains(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
+    """Add derivatives through how bodies of trees stand and move, which are used up.
+
+    Those by velocities at the end are added to `room.residual`.
+    """
+    m = scene.trees.nodes.shape[0]
+    for k in range(m):
+        n = m - 1 - k
+        node = scene.trees.nodes[n]
+        work = room.trees.chains[world, n].work
+        if node.alone == 0 and (room.trees.asked[world, n] > 0 or not (wp.length_sq(work) == ZERO)):
+            if node.kind == _ROOT:
+                b = node.place // 6
+                _a, _b, _c, by_velocity, _d, _e, _f = wp.grad(root_work)(
+                    room.given, world, node.body, room.velocity[world, b], room.step[world, b],
+                    room.bodies[world, node.origin].position, room.trees.chain_bars[world, n],
+                )  # fmt: skip
+                room.residual[world, b] = room.residual[world, b] + by_velocity
+            else:
+                pull_hanging(scene, room, world, n)
+                room.body_bars[world, node.body] = BodyState()
+            room.trees.chain_bars[world, n] = Chain()
+            room.trees.hanging_bars[world, n] = HangingBar()
+            room.trees.asked[world, n] = 0
+
+
+@wp.func
+def carrier_after(scene: wp.ref[Scene], launch: wp.ref[Launch], world: int, t: int, body: int) -> Carrier:
+    """What a joint hangs on at the end of a step, without its centre of mass."""
+    carrier = Carrier()
+    carrier.orientation = quat(ZERO, ZERO, ZERO, ONE)
+    if body >= 0:
+        row = launch.states[world, t * scene.body_index.shape[0] + body]
+        carrier.position = row.position
+        carrier.orientation = from_wxyz(row.orientation)
+    return carrier
+
+
+@wp.func
+def pull_places(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, t: int):
+    """Add derivatives through poses of bodies on joints at a step's end, to `after_bar` and `q_after`."""
+    m = scene.trees.nodes.shape[0]
+    for k in range(m):
+        node = scene.trees.nodes[m - 1 - k]
+        asked = room.after_bar[world, node.body]
+        size = wp.length_sq(asked.position) + wp.length_sq(asked.orientation)
+        if node.kind != _ROOT and not (size == ZERO):
+            q = vec3()
+            first = t * scene.trees.coordinates.shape[0] + node.coordinate
+            for part in range(node.width):
+                q[part] = launch.qs[world, first + part]
+            _z, _a, _b, _c, by_carrier, by_q, _d, _e = wp.grad(placing_work)(
+                room.given, room.given_trees, world, node,
+                carrier_after(scene, launch, world, t, node.carrier), q,
+                asked.position, asked.orientation,
+            )  # fmt: skip
+            if node.carrier >= 0:
+                room.after_bar[world, node.carrier].position += by_carrier.position
+                room.after_bar[world, node.carrier].orientation += to_wxyz(by_carrier.orientation)
+            for part in range(node.width):
+                room.trees.q_after[world, node.coordinate + part] += by_q[part]
+
+
+@wp.func
+def pull_coordinates(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
+    """Derivatives through joint coordinates at the end of a step, q⁺ = q + h y, and their velocities."""
     h = scene.timestep[world, 0]
+    for c in range(scene.trees.coordinates.shape[0]):
+        room.bars.q[world, c] = ZERO
+        room.bars.v[world, c] = ZERO
+    for n in range(scene.trees.nodes.shape[0]):
+        node = scene.trees.nodes[n]
+        if node.kind == _BALL:
+            bar = coordinates_of(room.trees.q_after, world, node)
+            for part in range(3):
+                room.trees.q_after[world, node.coordinate + part] = ZERO
+            _z, _a, _b, _c, by_y, _d = wp.grad(ball_work)(
+                room.given, room.given_trees, world, node, velocities_of(room.velocity, world, node), bar
+            )
+            add_unknowns(room.residual, world, node, by_y)
+    for c in range(scene.trees.coordinates.shape[0]):
+        u = scene.trees.coordinates[c].place
+        bar_q = room.trees.q_after[world, c]
+        room.bars.q[world, c] += bar_q
+        room.residual[world, u // 6][u % 6] += h * bar_q + room.trees.v_after[world, c]
+        room.bars.timestep[world, 0] += bar_q * unknown_of(room.velocity, world, u)
+
+
+@wp.func
+def ask_of_end(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
+    """Derivatives by the velocities of bodies on joints at the end of a step as those of `pull_chains`."""
+    for n in range(scene.trees.nodes.shape[0]):
+        node = scene.trees.nodes[n]
+        bar = HangingBar()
+        if node.kind != _ROOT:
+            bar.velocity = room.after_bar[world, node.body].velocity
+            bar.omega = room.after_bar[world, node.body].omega
+            room.bars.state[world, node.body] = StateRow()
+        room.trees.hanging_bars[world, n] = bar
+        room.trees.chain_bars[world, n] = Chain()
+        size = wp.length_sq(bar.velocity) + wp.length_sq(bar.omega)
+        room.trees.asked[world, n] = wp.where(size == ZERO, 0, 1)
+
+
+@wp.func
+def pull_laws(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
+    """Add derivatives through what acts on joint coordinates."""
+    h = scene.timestep[world, 0]
+    for c in range(scene.trees.coordinates.shape[0]):
+        coordinate = scene.trees.coordinates[c]
+        virtual = unknown_of(room.step, world, coordinate.place)
+        if virtual == ZERO:
+            continue
+        y = unknown_of(room.velocity, world, coordinate.place)
+        mass = h * room.trees.joints[world, c].rho
+        _z, _a, _b, _c, _d, _e, _f, _g = wp.grad(coordinate_work)(
+            room.given, room.given_trees, world, c, coordinate, y, mass, virtual
+        )
+
+
+@wp.func
+def pull_loops(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
+    """Add derivatives through the loops."""
     for row in range(scene.trees.loop_index.shape[0]):
         index = scene.trees.loop_index[row]
-        by_loop, by_first, by_second, _a, _b, _c, _d, by_h = wp.grad(loop_work)(
-            scene.trees.loops[world, row],
-            chain_of(room, world, index.first, index.first_body),
-            chain_of(room, world, index.second, index.second_body),
-            origin_of(scene, room, world, index.first),
-            origin_of(scene, room, world, index.second),
-            forces_of(scene, room.velocity, world, row),
-            forces_of(scene, room.step, world, row),
-            h,
-        )
-        add_chain(scene, room, world, index.first, index.first_body, by_first)
-        add_chain(scene, room, world, index.second, index.second_body, by_second)
-        add_timestep(bars, world, by_h)
-        add_loop(bars.loops, world, row, by_loop)
+        _z, _a, _b, _c, _d, _e, _f, _g, _h = wp.grad(loop_work)(
+            room.given, room.given_trees, world, row, index,
+            origin_of(scene, room, world, index.first), origin_of(scene, room, world, index.second),
+            forces_of(scene, room.velocity, world, row), forces_of(scene, room.step, world, row),
+        )  # fmt: skip
+        ask(room, world, index.first)
+        ask(room, world, index.second)
 
 
 @wp.func

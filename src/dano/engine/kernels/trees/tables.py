@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from dano.physics.pairs import BodyState
 from dano.physics.real import quat, real, vec3, vec6
 from dano.physics.trees.composites import Composite
 from dano.physics.trees.joint_laws import JointDrive, JointLaw, Ramps, Resolved
@@ -134,7 +133,6 @@ class Chain:
 class HangingBar:
     """By what the equations ask of a body on a joint besides its momentum."""
 
-    state: BodyState  # By how contact sees it at the start
     twist: vec6  # By the twist that contact sees at the end
     work: vec6  # By its virtual twist
     velocity: vec3  # By its velocity at the end
@@ -178,7 +176,5 @@ class TreeRoom:
     chain_bars: wp.array2d(dtype=Chain)  # Derivatives by these
     hanging_bars: wp.array2d(dtype=HangingBar)  # By what else is asked of bodies on joints
     asked: wp.array2d(dtype=wp.int32)  # Whether some of these are not zero
-    q_bar: wp.array2d(dtype=real)  # By joint coordinates at the start of a step, shape (worlds, coordinates)
-    v_bar: wp.array2d(dtype=real)  # By their velocities there
-    q_after: wp.array2d(dtype=real)  # By coordinates at its end
+    q_after: wp.array2d(dtype=real)  # By coordinates at the end of a step, shape (worlds, coordinates)
     v_after: wp.array2d(dtype=real)  # …
