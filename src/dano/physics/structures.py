@@ -33,45 +33,25 @@ def product_of(structure: Any) -> Any:
     return written(structure, "product", lines, inner)
 
 
-def sum_of(structure: Any) -> Any:
-    """Sum of two structures."""
-    return _of_fields(
-        structure, "summed", "def summed(a: S, b: S) -> S:", "a.{0} + b.{0}", "{1}(a.{0}, b.{0})", sum_of
-    )
-
-
 def scaled_of(structure: Any) -> Any:
     """A number times a structure."""
-    return _of_fields(
-        structure, "scaled", "def scaled(s: real, a: S) -> S:", "a.{0} * s", "{1}(s, a.{0})", scaled_of
-    )
-
-
-def _of_fields(structure: Any, name: str, head: str, plain: str, nested: str, inner: Any) -> Any:
-    """A function that writes each field of a structure `a` anew, and returns it.
-
-    Args:
-        structure: The structure.
-        name: Of the function.
-        head: Its first line.
-        plain: What a field of numbers becomes; {0} is its name.
-        nested: What a structure within becomes; {1} is the function for it.
-        inner: Makes that function.
-    """
-    lines, names = [], {}
-    for field, kind in fields_of(structure):
+    lines, inner = [], {}
+    for name, kind in fields_of(structure):
         if _is_structure(kind):
-            names[f"inner_{field}"] = inner(kind)
-            lines.append(f"    a.{field} = {nested.format(field, f'inner_{field}')}")
-        else:
-            lines.append(f"    a.{field} = {plain.format(field)}")
-    return written(structure, name, [head, *lines, "    return a"], names)
+            inner[f"inner_{name}"] = scaled_of(kind)
+        term = f"inner_{name}(s, a.{name})" if _is_structure(kind) else f"a.{name} * s"
+        lines.append(f"    a.{name} = {term}")
+    return written(structure, "scaled", ["def scaled(s: real, a: S) -> S:", *lines, "    return a"], inner)
 
 
 def adding_of(structure: Any) -> Any:
-    """Add a structure to another in place: where that is one of several ways to go on, nothing is copied."""
-    lines = [f"    a.{name} = a.{name} + b.{name}" for name in leaf_names(structure)]
-    return written(structure, "adding", ["def adding(a: wp.ref[S], b: S):", *lines])
+    """Add a structure of real numbers to another in place, which may be one of an array."""
+
+    def add(a: wp.ref[structure], b: structure): ...
+
+    add.__name__ = add.__qualname__ = f"add_{structure.key}"
+    # Warp's structures have this operator for their adjoints.
+    return wp.func_native("a += b;")(add)
 
 
 def addition_of(structure: Any) -> Any:

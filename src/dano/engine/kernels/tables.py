@@ -8,6 +8,7 @@ import warp as wp
 
 from dano.engine.kernels.patch_tables import PatchRoom, PatchSide, PatchTables
 from dano.engine.kernels.trees.tables import Chain, TreeRoom, Trees
+from dano.physics.features import ADJOINTS
 from dano.physics.impacts import Impact, Patch, Rest
 from dano.physics.overlap import Part, Sums, WeightedSample
 from dano.physics.pairs import BodyState
@@ -352,23 +353,24 @@ class Room:
     tried: wp.array2d(dtype=vec6)
     best: wp.array2d(dtype=vec6)
     moved: wp.array2d(dtype=vec6)
-    late: wp.array2d(dtype=vec6)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)
     patches: PatchRoom
     trees: TreeRoom
-    given: Given
-    given_trees: GivenTrees
-    given_patches: GivenPatches
-    bars: Bars
-    body_bars: wp.array2d(dtype=BodyState)
-    after_bar: wp.array2d(dtype=StateRow)
     wrenches: wp.array2d(dtype=vec6)
-    missing: wp.array2d(dtype=vec6)
-    along: wp.array2d(dtype=real)
-    moving: wp.array2d(dtype=real)
-    parts: wp.array2d(dtype=real)
+    if ADJOINTS:
+        late: wp.array2d(dtype=vec6)
+        given: Given
+        given_trees: GivenTrees
+        given_patches: GivenPatches
+        bars: Bars
+        body_bars: wp.array2d(dtype=BodyState)
+        after_bar: wp.array2d(dtype=StateRow)
+        missing: wp.array2d(dtype=vec6)
+        along: wp.array2d(dtype=real)
+        moving: wp.array2d(dtype=real)
+        parts: wp.array2d(dtype=real)
 
 
 @wp.struct

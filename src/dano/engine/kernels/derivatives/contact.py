@@ -46,7 +46,7 @@ from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.solids.grids import distance_change
 from dano.physics.solids.kinds import GRID
 from dano.physics.solids.leaves import Distance, Leaf
-from dano.physics.structures import adding_of, addition_of, after_adjoints, product_of, scaled_of, sum_of
+from dano.physics.structures import adding_of, addition_of, after_adjoints, product_of, scaled_of
 from dano.physics.twists import relative_twist
 
 _BALL, _GRID, _LANES = wp.constant(BALL), wp.constant(GRID), wp.constant(LANES)
@@ -54,7 +54,7 @@ _PRESSES, _MEETS, _RESTS = wp.constant(PRESSES), wp.constant(MEETS), wp.constant
 
 
 add_to_met, total_met = adding_of(MetPair), total_of(MetPair)
-scaled_met, summed_body = scaled_of(MetPair), sum_of(BodyState)
+scaled_met, add_to_state = scaled_of(MetPair), adding_of(BodyState)
 add_to_touching, total_touching = adding_of(Touching), total_of(Touching)
 add_to_twists, total_twists = adding_of(Virtual), total_of(Virtual)
 add_to_leaf, add_to_material = addition_of(Leaf), addition_of(Material)

@@ -11,7 +11,7 @@ from dano.engine.kernels.derivatives.adjoint import (
     state_work,
     Virtual,
 )
-from dano.engine.kernels.derivatives.contact import pull_pair, summed_body
+from dano.engine.kernels.derivatives.contact import add_to_state, pull_pair
 from dano.engine.kernels.derivatives.patches import pull_patch
 from dano.engine.kernels.derivatives.trees import (
     add_hanging,
@@ -172,7 +172,7 @@ def add_to_body(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, bar: BodyState, twist: vec6, work: vec6
 ):
     """Add derivatives by how contact sees a body, and by its twists if it is on a joint."""
-    room.body_bars[world, body] = summed_body(room.body_bars[world, body], bar)
+    add_to_state(room.body_bars[world, body], bar)
     row = scene.body_index[body].row
     if hangs(scene, row):
         add_hanging(room, world, row, twist, work)

@@ -40,7 +40,7 @@ from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.grids import moved_kind, moved_solids
 from dano.physics.solids.kinds import HALF_SPACE, SPHERE
 from dano.physics.solids.leaves import Solids
-from dano.physics.structures import need_adjoints, product_of, sum_of, vjp_of
+from dano.physics.structures import adding_of, need_adjoints, product_of, vjp_of
 from dano.physics.twists import relative_twist
 
 
@@ -129,7 +129,7 @@ def view_at(
 
 sample_sums_work, plane_work, shell_work = map(vjp_of, (sample_sums, plane_density, shell_density))
 grid_work, view_work = vjp_of(grid_at), vjp_of(view_at)
-summed_view, total_view = sum_of(View), total_of(View)
+add_to_view, total_view = adding_of(View), total_of(View)
 density_product = product_of(Density)
 
 for _function in (patch_work, sample_sums_work, plane_work, shell_work, grid_work, view_work):
@@ -197,7 +197,7 @@ def pull_weighted(
                         view, field.part.edge, sample.point, by_density
                     )
                     room.bars.parts[world, field.first].edge += by_edge
-                    found = summed_view(found, by_view)
+                    add_to_view(found, by_view)
                     by_point += of_point
                 else:
                     # x = rotation · point + origin
