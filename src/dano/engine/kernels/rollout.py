@@ -4,10 +4,11 @@ import warp as wp
 
 from dano.engine.kernels.impacts import balance_when_met, find_moved
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.linear_solve import find_pattern
+from dano.engine.kernels.linear_solve import find_pattern, forget_blocks
 from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
 from dano.engine.kernels.solve import Options, solve, Solved
+from dano.engine.kernels.sweep import forget_candidates
 from dano.engine.kernels.tables import Push, Room, Scene, StateRow, StepReport
 from dano.engine.kernels.trees.balance import begin_joints, begin_trees
 from dano.engine.kernels.trees.contact import free_block
@@ -276,10 +277,20 @@ def begin_step_of_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int, la
 
 
 @wp.func
+def forget(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int):
+    """Forget what is kept from step to step: a launch begins."""
+    forget_candidates(scene, room, world, lane)
+    forget_blocks(scene, room, world, lane)
+
+
+@wp.func
 def begin_unpushed(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, launch: wp.ref[Launch], t: int
 ):
     """What is known at the start of a step that was not, or need not be, pushed."""
+    if t == 0 or t == launch.n_steps - 1:
+        # A launch begins with one of these.
+        forget(scene, room, world, lane)
     for i in range(scene.body_index.shape[0]):
         push = Push()
         begin_body(scene, room, world, i, row_before(scene, launch, world, t, i), push)
@@ -357,6 +368,7 @@ def rollout(scene: Scene, room: Room, launch: Launch):
     block, lane = wp.tid()
     world = launch.first_world + block
     n = scene.body_index.shape[0]
+    forget(scene, room, world, lane)
     for t in range(launch.n_steps):
         size = real(0.0)
         for i in range(n):

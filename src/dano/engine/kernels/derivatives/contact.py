@@ -30,7 +30,7 @@ from dano.engine.kernels.derivatives.products import (
 )
 from dano.engine.kernels.lanes import total, total3, total6, total33
 from dano.engine.kernels.near import as_they_meet, facing, left_out, posed, solid_of_body
-from dano.engine.kernels.tables import Changes, FoundPair, Moment, Room, Scene
+from dano.engine.kernels.tables import Changes, FoundPair, Moment, numbers_of, Room, Scene
 from dano.physics.features import TREES, UNIONS
 from dano.physics.impacts import fall_of, Impact, Patch, Rest
 from dano.physics.pairs import (
@@ -119,7 +119,7 @@ def pull_patch_of_impact(
 ) -> tuple[PairPose, real, real, real, real]:
     """Derivatives by the pose of a pair, τ, h, δ and `left_out` from the patch of its impact, by lanes."""
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
+    pair = numbers_of(scene, world, found.pair)
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
     pose_bar = PairPose()
@@ -158,7 +158,7 @@ def pull_patch_of_impact(
     bounce_bar = total(bounce_bar)
     if lane == 0:
         if bars.pairs.shape[1] > 0:
-            bars.pairs[world, found.pair].share += share_of_bar
+            bars.pairs[world, index.row].share += share_of_bar
         if bars.materials.shape[1] > 0:
             bars.materials[world, index.contact].bounce += bounce_bar
     return pose_bar, share_bar, h_bar, depth_bar, rests_bar
@@ -181,7 +181,7 @@ def pull_points(
     Adds those by samples, solids and materials.
     """
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
+    pair = numbers_of(scene, world, found.pair)
     turning = scene.body_index[index.first].turning
     material = scene.materials[world, index.contact]
     h = scene.timestep[world, 0]
@@ -245,7 +245,7 @@ def pull_points(
             add_to_material(whole, material_bar)
             bars.materials[world, index.contact] = whole
         if bars.pairs.shape[1] > 0:
-            bars.pairs[world, found.pair].share += stiffness_share_bar
+            bars.pairs[world, index.row].share += stiffness_share_bar
     if wp.static(TREES):
         twists_bar.first = total6(twists_bar.first)
         twists_bar.second = total6(twists_bar.second)
@@ -350,7 +350,7 @@ def pull_pose(
     One lane alone comes here: Warp itself adds those by coefficients.
     """
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
+    pair = numbers_of(scene, world, found.pair)
     turning = scene.body_index[index.first].turning
     scale = scene.bodies[world, index.first].scale
     h = scene.timestep[world, 0]
@@ -433,7 +433,7 @@ def pull_rest(
 ) -> tuple[PairPose, PairBar]:
     """Derivatives by the pose with which a step begins, and by the bodies, from what a pair rests on."""
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
+    pair = numbers_of(scene, world, found.pair)
     turning = scene.body_index[index.first].turning
     bounce = scene.materials[world, index.contact].bounce
     h = scene.timestep[world, 0]
@@ -501,7 +501,7 @@ def pull_support(
         bar: Derivatives by bodies as they meet, of the first lane.
     """
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
+    pair = numbers_of(scene, world, found.pair)
     material = scene.materials[world, index.contact]
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
@@ -565,7 +565,7 @@ def pull_pair(
         moment_bar: Derivatives by when the angular momentum of its bodies is balanced.
     """
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
+    pair = numbers_of(scene, world, found.pair)
     h = scene.timestep[world, 0]
     a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
     pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)

@@ -91,12 +91,12 @@ def pull_touching(
     if bars.bodies.shape[1] > 0:
         bars.bodies[world, index.first].scale += bar.scale
     add_timestep(bars, world, bar.timestep)
-    # Pairs with a patch stand behind those with points, and have no depth of their own.
-    if found.pair < bars.pairs.shape[1]:
-        bars.pairs[world, found.pair].sink += bar.sink
-        bars.pairs[world, found.pair].impact_depth += bar.impact_depth
-        bars.pairs[world, found.pair].factor += bar.factor
-        bars.pairs[world, found.pair].deepest += bar.deepest
+    # Pairs with a patch have no depth of their own.
+    if index.row >= 0 and bars.pairs.shape[1] > 0:
+        bars.pairs[world, index.row].sink += bar.sink
+        bars.pairs[world, index.row].impact_depth += bar.impact_depth
+        bars.pairs[world, index.row].factor += bar.factor
+        bars.pairs[world, index.row].deepest += bar.deepest
 
 
 @after_adjoints
@@ -152,15 +152,13 @@ def is_moved_pair(twists: Virtual) -> bool:
 
 
 @wp.func
-def moment_bar_of(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, found: FoundPair
-) -> Moment:
+def moment_bar_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> Moment:
     """A pair's part of derivatives by when the angular momentum of the body that moves is balanced."""
     bar = Moment()
     if wp.static(not TREES):
         if found.impact.delays > ZERO:
             body = moving_of(scene, found)
-            count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
+            count = meetings_of(scene, room, world, body)[0]
             row = scene.body_index[body].row
             bar.met = room.moment_bar[world, row].met / count
             bar.lead = room.moment_bar[world, row].lead / count
@@ -189,7 +187,7 @@ def pull_equations(
     for f in range(n_found):
         found = room.found[world, f * _LANES + lane]
         twists = twists_of_pair(scene, room, world, found)
-        moment_bar = moment_bar_of(scene, room, world, n_found, found)
+        moment_bar = moment_bar_of(scene, room, world, found)
         if is_moved_pair(twists) or moment_bar.met != ZERO or moment_bar.lead != ZERO:
             rebound = launch.reports[world, t].rebound
             bar = pull_pair(scene, room, bars, world, lane, found, rebound, twists, moment_bar)

@@ -88,7 +88,7 @@ def clear_pair(
             if bars.materials.shape[1] > 0:
                 bars.materials[world, index.contact] = Material()
             if bars.pairs.shape[1] > 0:
-                bars.pairs[world, found.pair] = SamplePair()
+                bars.pairs[world, index.row] = SamplePair()
             solid = scene.body_index[index.second]
             clear_leaves(bars, world, solid.first_leaf, solid.leaves)
     clear_splines(room, world, lane)
@@ -116,8 +116,8 @@ def change_of_points(
         at = direction * scene.materials.shape[1] + index.contact
         change += material_product(bars.materials[world, index.contact], changes.materials[world, at])
     if changes.pairs.shape[1] > 0:
-        at = direction * scene.pairs.shape[1] + found.pair
-        change += pair_product(bars.pairs[world, found.pair], changes.pairs[world, at])
+        at = direction * scene.pairs.shape[1] + index.row
+        change += pair_product(bars.pairs[world, index.row], changes.pairs[world, at])
     solid = scene.body_index[index.second]
     return change + change_by_leaves(changes, bars, world, solid.first_leaf, solid.leaves, direction)
 
@@ -206,7 +206,7 @@ def add_meeting(
 ):
     """Add a pair's part of the change of when the angular momentum of the body that moves is balanced."""
     body = moving_of(scene, found)
-    count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
+    count = meetings_of(scene, room, world, body)[0]
     at = direction * scene.moving.shape[0] + scene.body_index[body].row
     if of_met:
         room.moments[world, at].met += change / count
