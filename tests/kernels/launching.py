@@ -67,12 +67,12 @@ class Arguments:
         }
         for place, rows in filled.items():
             self.put(place, rows)
-        of_moving = ("momentum", "inertia", "meetings", "velocity", "tried", "best", "step", "residual", "scale")
-        of_rows = ("order", "counts", "neighbours", "degrees", "islands", "members", "parts", "begins", "ends")
+        of_moving = "momentum inertia meetings velocity tried best step residual scale moved".split()
+        of_rows = "order counts neighbours degrees islands members parts begins ends rests asleep".split()
         lengths = {
-            **dict.fromkeys(("bodies", "partners"), n),
+            **dict.fromkeys(("bodies", "partners", "sizes"), n),
             **dict.fromkeys(("found", "sorted_pairs"), len(pairs)),
-            **dict.fromkeys((*of_moving, *of_rows, "moved"), m),
+            **dict.fromkeys((*of_moving, *of_rows), m),
             **dict.fromkeys(("used", "later", "beside", "listed"), m * m),
             **dict.fromkeys(("blocks", "spare"), m * m + 1),
             "lasting": 1,

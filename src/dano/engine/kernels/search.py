@@ -21,6 +21,7 @@ from dano.engine.kernels.near import (
     solid_of_body,
     stretch_of,
 )
+from dano.engine.kernels.sleep import is_idle, wake_near
 from dano.engine.kernels.sweep import find_candidates, may_be_near
 from dano.engine.kernels.tables import (
     BLOCK,
@@ -492,11 +493,13 @@ def find_contacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
     n_found = int(0)
     overflow = bool(False)
     candidates = find_candidates(scene, room, world, lane)
+    wake_near(scene, room, world, candidates)
     for c in range(wp.where(candidates < 0, scene.n_pressing, candidates)):
         p = c
-        near = bool(True)
         if candidates >= 0:
             p = room.candidates[world, c]
+        near = not is_idle(scene, room, world, p)
+        if near and candidates >= 0:
             near = may_be_near(scene, room, world, p)
         if near:
             index = scene.pair_index[p]

@@ -32,6 +32,7 @@ from dano.engine.kernels.linear_solve import (
     worse_of,
 )
 from dano.engine.kernels.patches import add_patches, any_sticks, fit_patch_duals, follow_patch_duals
+from dano.engine.kernels.sleep import sleeps
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import (
     add_tree_slopes,
@@ -455,7 +456,7 @@ def solve(
         if wp.static(ISLANDS):
             island = room.islands[world, i]
         # An island has the number of its first body.
-        if island == EVERYWHERE or island == i:
+        if (island == EVERYWHERE or island == i) and not sleeps(room, world, i):
             one = solve_island(scene, room, world, lane, n_found, size, options, island)
             whole.residual = wp.max(whole.residual, one.residual)
             whole.passes = wp.max(whole.passes, one.passes)

@@ -141,7 +141,8 @@ class Lasting:
     """What is kept from one step to the next."""
 
     candidates: wp.int32  # Pairs that may be near; −1 where they are not known
-    blocks: wp.int32  # Of the Jacobian that are in use; −1 where that is not known
+    blocks: wp.int32  # Of the Jacobian that are in use
+    asleep: wp.int32  # Bodies that sleep
     margin: real  # Largest of all pairs [m]
 
 
@@ -264,6 +265,9 @@ class Room:
         members: Blocks of unknowns, island by island.
         sorted_pairs: Pairs with points, island by island.
         parts: Where islands begin and end, by the first of their blocks.
+        rests: Whether bodies that move rest at the end of a step.
+        asleep: Number of the island that each of them sleeps with, −1 where it is awake.
+        sizes: Of the velocities that each body's momentum stands for [m/s].
         listed: Row and column of each block of the Jacobian.
         begins: Where those of each row begin and end.
         ends: …
@@ -323,6 +327,9 @@ class Room:
     members: wp.array2d(dtype=wp.int32)
     sorted_pairs: wp.array2d(dtype=wp.int32)
     parts: wp.array2d(dtype=Island)
+    rests: wp.array2d(dtype=wp.int32)
+    asleep: wp.array2d(dtype=wp.int32)
+    sizes: wp.array2d(dtype=real)
     listed: wp.array2d(dtype=wp.int32)
     begins: wp.array2d(dtype=wp.int32)
     ends: wp.array2d(dtype=wp.int32)

@@ -170,11 +170,11 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
     blocks = tables.structure.n_blocks
     most = int(max(whole["scene.body_index"][:, 2], default=0))
     lengths = {
-        **dict.fromkeys(("bodies", "partners"), n),
+        **dict.fromkeys(("bodies", "partners", "sizes"), n),
         **dict.fromkeys(("momentum", "inertia", "meetings"), m),
         **dict.fromkeys(("velocity", "old", "tried", "best", "moved", "step", "residual", "scale"), blocks),
         **dict.fromkeys(("order", "counts", "degrees", "neighbours", "islands", "members", "parts"), blocks),
-        **dict.fromkeys(("begins", "ends"), blocks),
+        **dict.fromkeys(("begins", "ends", "rests", "asleep"), blocks),
         **dict.fromkeys(("used", "later", "beside", "listed"), blocks * blocks),
         **dict.fromkeys(("blocks", "spare"), blocks * blocks + 1),
         "lasting": 1,
