@@ -47,18 +47,21 @@ class Crowd:
         members: The bodies.
         n_steps: Of a call: through the fall, to a heap.
         by_body: Whether times are those of a step and body.
+        rests: Whether it begins at rest.
     """
 
     name: str
     members: tuple[Member, ...]
     n_steps: int
     by_body: bool = False
+    rests: bool = False
 
     @property
     def group(self) -> str:
         """Heading in the table."""
         if self.by_body:
-            return f"Boxes dropped, {self.n_steps} steps of {1000 * TIMESTEP:g} ms, per step and box"
+            how = "at rest on a floor" if self.rests else "dropped"
+            return f"Boxes {how}, {self.n_steps} steps of {1000 * TIMESTEP:g} ms, per step and box"
         return f"{self.name} dropped, {self.n_steps} steps of {1000 * TIMESTEP:g} ms, per step"
 
     @property
@@ -82,11 +85,23 @@ PILES = {8: 2, 64: 4, 200: 5, 500: 8, 1000: 10}
 
 
 def piles() -> tuple[Crowd, ...]:
-    """Boxes that fall on each other, more and more of them."""
-    return tuple(
+    """Boxes that fall on each other, and some that stand side by side, more and more of them."""
+    falling = [
         Crowd(f"{n} boxes in layers of {across * across}", _stacked(["box"] * n, across), 100, by_body=True)
         for n, across in PILES.items()
-    )
+    ]
+    resting = [
+        Crowd(f"{n} boxes side by side", _side_by_side(n), 500, by_body=True, rests=True) for n in PILES
+    ]
+    return (*falling, *resting)
+
+
+def _side_by_side(n: int) -> tuple[Member, ...]:
+    """Boxes that stand on the floor."""
+    across = round(n**0.5)
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    places = [3 * HALF * np.array([i % across, i // across, 0]) + [0, 0, HALF] for i in range(n)]
+    return tuple(Member("box", place, upright) for place in places)
 
 
 def _stacked(kinds: list[str], across: int, pitch: float = 0.15) -> tuple[Member, ...]:

@@ -59,7 +59,8 @@ def _parts() -> dict[str, Callable[[list[_subjects.Subject]], list[Case]]]:
 
 
 def _key(crowd: _crowds.Crowd) -> str:
-    return f"{'pile' if crowd.by_body else 'crowd'}-{len(crowd.members)}"
+    kind = ("rest" if crowd.rests else "pile") if crowd.by_body else "crowd"
+    return f"{kind}-{len(crowd.members)}"
 
 
 def _mujoco_parts() -> dict[str, Callable[[], list[Case]]]:
