@@ -41,7 +41,8 @@ def main() -> None:
     axes.set_xlabel("boxes")
     axes.set_ylabel("time of a step and box [µs]")
     axes.grid(True, which="both", alpha=0.25)
-    axes.legend(frameon=False)
+    axes.set_ylim(0.5, 200)
+    axes.legend(loc="center right", bbox_to_anchor=(1.0, 0.63), frameon=False)
     figure.savefig(given[1] if len(given) > 1 else PICTURE, dpi=110)
 
 

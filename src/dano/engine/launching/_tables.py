@@ -368,7 +368,9 @@ def _kinds_of_contacts(
     if scene.others is None:
         return np.arange(named), _NONE
     rest = scene.others.pairs.array
-    some, row = _first_of_each(kinds[rest[:, 0]] * len(kinds) + kinds[rest[:, 1]])
+    # Parameters of a pair do not depend on which of its bodies comes first.
+    low, high = np.sort(kinds[rest], axis=1).T
+    some, row = _first_of_each(low * len(kinds) + high)
     return np.concatenate([np.arange(named), named + row]), rest[some]
 
 
