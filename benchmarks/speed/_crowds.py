@@ -1,5 +1,6 @@
 """Scenes of several bodies that may all touch, in dano."""
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,16 +46,28 @@ class Crowd:
         name: For the table.
         members: The bodies.
         n_steps: Of a call: through the fall, to a heap.
+        by_body: Whether times are those of a step and body.
+        rests: Whether it begins at rest.
     """
 
     name: str
     members: tuple[Member, ...]
     n_steps: int
+    by_body: bool = False
+    rests: bool = False
 
     @property
     def group(self) -> str:
         """Heading in the table."""
+        if self.by_body:
+            how = "at rest on a floor" if self.rests else "dropped"
+            return f"Boxes {how}, {self.n_steps} steps of {1000 * TIMESTEP:g} ms, per step and box"
         return f"{self.name} dropped, {self.n_steps} steps of {1000 * TIMESTEP:g} ms, per step"
+
+    @property
+    def count(self) -> int:
+        """What the time of a call is divided by."""
+        return self.n_steps * (len(self.members) if self.by_body else 1)
 
 
 def crowds() -> tuple[Crowd, ...]:
@@ -65,6 +78,30 @@ def crowds() -> tuple[Crowd, ...]:
         Crowd("16 trained bunnies", _stacked(["bunny"] * 16, 2), 100),
         Crowd("64 bodies (32 boxes, 32 spheres)", _stacked(mixed, 4), 100),
     )
+
+
+PILES = {8: 2, 64: 4, 200: 5, 500: 8, 1000: 10}
+"""Boxes of a pile, and how many stand side by side."""
+
+
+def piles() -> tuple[Crowd, ...]:
+    """Boxes that fall on each other, and some that stand side by side, more and more of them."""
+    falling = [
+        Crowd(f"{n} boxes in layers of {across * across}", _stacked(["box"] * n, across), 100, by_body=True)
+        for n, across in PILES.items()
+    ]
+    resting = [
+        Crowd(f"{n} boxes side by side", _side_by_side(n), 500, by_body=True, rests=True) for n in PILES
+    ]
+    return (*falling, *resting)
+
+
+def _side_by_side(n: int) -> tuple[Member, ...]:
+    """Boxes that stand on the floor."""
+    across = round(n**0.5)
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    places = [3 * HALF * np.array([i % across, i // across, 0]) + [0, 0, HALF] for i in range(n)]
+    return tuple(Member("box", place, upright) for place in places)
 
 
 def _stacked(kinds: list[str], across: int, pitch: float = 0.15) -> tuple[Member, ...]:
@@ -82,6 +119,28 @@ def _stacked(kinds: list[str], across: int, pitch: float = 0.15) -> tuple[Member
 
 def crowd_case(crowd: Crowd) -> Case:
     """A rollout of a crowd from its start."""
+    scene, state = _begun(crowd)
+    return _case(crowd.group, crowd.name, scene, state, crowd.n_steps)
+
+
+def pile_case(crowd: Crowd) -> Case:
+    """The same outside of `jax.jit`: rows of many pairs are computed once, and nothing is compiled."""
+    scene, state = _begun(crowd)
+    began = time.process_time()
+    done = dano.simulate(scene, state, crowd.n_steps)
+    note = f"{_note(scene, done)}, the first call {time.process_time() - began:.1f} s"
+    return Case(
+        crowd.group,
+        crowd.name,
+        lambda: jax.block_until_ready(dano.simulate(scene, state, crowd.n_steps)),
+        crowd.count,
+        note=note,
+        repeats=REPEATS,
+    )
+
+
+def _begun(crowd: Crowd) -> tuple[dano.Scene, dano.State]:
+    """The scene of a crowd, and its start."""
     bodies = [
         dano.Body(f"b{i}", _geometry(member.kind), mass=MASS[member.kind])
         for i, member in enumerate(crowd.members)
@@ -93,7 +152,7 @@ def crowd_case(crowd: Crowd) -> Case:
         f"b{i}": {"position": member.position, "orientation": member.orientation}
         for i, member in enumerate(crowd.members)
     }
-    return _case(crowd.group, crowd.name, scene, scene.initial_state(**starts), crowd.n_steps)
+    return scene, scene.initial_state(**starts)
 
 
 DEMO = "Drop of the demo (bunny, soap, ball, floor), 320 steps of 5 ms, per step"
@@ -119,15 +178,19 @@ def _case(group: str, name: str, scene: dano.Scene, state: dano.State, n_steps: 
 
     run, seconds = compiled(rollout, arrays, state)
     done = jax.block_until_ready(run(arrays, state))
-    iterations, failed = np.asarray(done.iterations), int((~np.asarray(done.converged)).sum())
-    note = f"{len(scene.pairs)} pairs, {iterations.mean():.1f} iterations"
-    note += f", {failed} steps NOT converged" if failed else ""
     return Case(
         group,
         name,
         lambda: run(arrays, state),
         n_steps,
         compile_seconds=seconds,
-        note=note,
+        note=_note(scene, done),
         repeats=REPEATS,
     )
+
+
+def _note(scene: dano.Scene, done: dano.Trajectory) -> str:
+    """How many pairs may touch, and how the solver did."""
+    iterations, failed = np.asarray(done.iterations), int((~np.asarray(done.converged)).sum())
+    note = f"{len(scene.point_pairs)} pairs, {iterations.mean():.1f} iterations"
+    return note + (f", {failed} steps NOT converged" if failed else "")

@@ -20,7 +20,8 @@ def mujoco_crowd_case(crowd: Crowd) -> Case:
     """A crowd from the same start, for as many steps."""
     center = _bunny_center() if any(member.kind == "bunny" for member in crowd.members) else np.zeros(3)
     bodies = "".join(_body(member, _geom(member.kind, center)) for member in crowd.members)
-    return _case(crowd.group, f"MuJoCo: {crowd.name}", bodies, crowd.n_steps)
+    name = f"MuJoCo: {crowd.name}"
+    return _case(crowd.group, name, bodies, crowd.n_steps, count=crowd.count)
 
 
 def mujoco_demo_case() -> Case:
@@ -63,7 +64,14 @@ def _body(member: Member, geom: str) -> str:
     )
 
 
-def _case(group: str, name: str, bodies: str, n_steps: int, speeds: dict[int, float] | None = None) -> Case:
+def _case(
+    group: str,
+    name: str,
+    bodies: str,
+    n_steps: int,
+    speeds: dict[int, float] | None = None,
+    count: int | None = None,
+) -> Case:
     import mujoco
 
     scale = _words([BUNNY_SIZE] * 3)
@@ -86,7 +94,7 @@ def _case(group: str, name: str, bodies: str, n_steps: int, speeds: dict[int, fl
     note = f"{data.ncon} contact points at the end"
     # A blown-up simulation goes on from its initial state, which would pass for a fast one.
     note += ", UNSTABLE" if any(warning.number for warning in data.warning) else ""
-    return Case(group, name, run, n_steps, note=note, repeats=REPEATS)
+    return Case(group, name, run, count or n_steps, note=note, repeats=REPEATS)
 
 
 def _words(numbers: Sequence[float] | np.ndarray) -> str:

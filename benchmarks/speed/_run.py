@@ -53,11 +53,14 @@ def _parts() -> dict[str, Callable[[list[_subjects.Subject]], list[Case]]]:
     }
     for crowd in _crowds.crowds():
         parts[_key(crowd)] = lambda _, crowd=crowd: [_crowds.crowd_case(crowd)]
+    for crowd in _crowds.piles():
+        parts[_key(crowd)] = lambda _, crowd=crowd: [_crowds.pile_case(crowd)]
     return {**parts, "learning": lambda _: _learning.learning_cases(_learning.bunny_photographs())}
 
 
 def _key(crowd: _crowds.Crowd) -> str:
-    return f"crowd-{len(crowd.members)}"
+    kind = ("rest" if crowd.rests else "pile") if crowd.by_body else "crowd"
+    return f"{kind}-{len(crowd.members)}"
 
 
 def _mujoco_parts() -> dict[str, Callable[[], list[Case]]]:
@@ -66,7 +69,7 @@ def _mujoco_parts() -> dict[str, Callable[[], list[Case]]]:
         "pressed": _mujoco.mujoco_pressed_cases,
         "demo": lambda: [_mujoco_crowds.mujoco_demo_case()],
     }
-    for crowd in _crowds.crowds():
+    for crowd in (*_crowds.crowds(), *_crowds.piles()):
         parts[_key(crowd)] = lambda crowd=crowd: [_mujoco_crowds.mujoco_crowd_case(crowd)]
     return parts
 
@@ -85,7 +88,7 @@ def _chosen(arguments: argparse.Namespace, missing: list[Row]) -> list[str]:
     names = [name for name in _parts() if any(word in name for word in words)]
     if not names:
         raise SystemExit(f"--only must name some of {', '.join(_parts())}, got {' '.join(words)}")
-    for crowd in _crowds.crowds():
+    for crowd in (*_crowds.crowds(), *_crowds.piles()):
         if _key(crowd) in names and len(crowd.members) > arguments.largest:
             names.remove(_key(crowd))
             reason = f"more than --largest {arguments.largest} bodies"

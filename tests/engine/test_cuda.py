@@ -12,7 +12,7 @@ import warp as wp
 
 import dano
 from dano.engine._reports import SolverOptions
-from dano.engine.launching import _cpu, _cuda, listed_points, rollout, scene_tables
+from dano.engine.launching import _cpu, _cuda, _tables, listed_points, rollout, scene_tables
 from dano.native import begin, Features, instance
 
 N_STEPS, ROOM = 4, 16
@@ -98,9 +98,11 @@ def test_lanes_list_the_same_points(stack, in_lanes):
     np.testing.assert_allclose(many, one, atol=1e-13)
 
 
-def test_lanes_take_the_same_steps(stack, in_lanes):
+@pytest.mark.parametrize("swept", [False, True], ids=["all pairs", "sweep"])
+def test_lanes_take_the_same_steps(swept, stack, in_lanes, monkeypatch):
     """A rollout of worlds that differ."""
     scene, state = stack
+    monkeypatch.setattr(_tables, "SWEPT", 0 if swept else 100)
     velocities = state.velocity[None] * jnp.linspace(0.9, 1.1, 3)[:, None, None]
 
     def worlds():

@@ -67,20 +67,17 @@ class Arguments:
         }
         for place, rows in filled.items():
             self.put(place, rows)
-        of_moving = (
-            "momentum",
-            "inertia",
-            "velocity",
-            "tried",
-            "best",
-            "step",
-            "residual",
-            "scale",
-            "order",
-            "counts",
-        )
-        lengths = {"bodies": n, "found": len(pairs), **dict.fromkeys(of_moving, m)}
-        give_room(self.room, {**lengths, **dict.fromkeys(("blocks", "spare", "used", "later"), m * m)})
+        of_moving = "momentum inertia meetings velocity tried best step residual scale moved".split()
+        of_rows = "order counts neighbours degrees islands members parts begins ends rests asleep".split()
+        lengths = {
+            **dict.fromkeys(("bodies", "partners", "sizes"), n),
+            **dict.fromkeys(("found", "sorted_pairs"), len(pairs)),
+            **dict.fromkeys((*of_moving, *of_rows), m),
+            **dict.fromkeys(("used", "later", "beside", "listed"), m * m),
+            **dict.fromkeys(("blocks", "spare"), m * m + 1),
+            "lasting": 1,
+        }
+        give_room(self.room, lengths)
         of_contacts = dict.fromkeys(self.room.patches._cls.vars, len(pairs))
         give_room(self.room.patches, {**of_contacts, "count": 1, "sums": 0})
 

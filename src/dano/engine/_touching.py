@@ -73,6 +73,6 @@ def _places(
     of_patches = listed[~presses]
     index = tables.whole.arrays["scene.pair_index"]
     n_points = len(index) - len(of_patches)
-    pair = np.array([*np.array(of_points, int)[index[:n_points, 2]], *of_patches], int)
+    pair = np.array([*np.array(of_points, int)[index[:n_points, 4]], *of_patches], int)
     first = np.array([scene.index(a) for a, _ in scene.pairs], int)[pair]
     return pair, np.where(index[:, 0] == first, 1, -1), index[:, 0]

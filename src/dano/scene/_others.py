@@ -110,7 +110,11 @@ class Others(eqx.Module):
         √(μ_a μ_b) of the sliding frictions; of restitution, stiffness, hysteresis and fading the larger; of
         `restitution_velocity`, `impact_depth` and `friction_pressure` the smaller.
         """
-        first, second = self.pairs.array.T
+        return self.params_of(self.pairs.array)
+
+    def params_of(self, pairs: Int[np.ndarray, "k 2"]) -> ContactParams:
+        """`pair_params` of some pairs of indices of bodies, arrays of shape (k,)."""
+        first, second = pairs.T
         a, b = (jax.tree.map(lambda x, rows=rows: x[rows], self.params) for rows in (first, second))
         found = combined(a, b)
         flat = np.array(self.flat)

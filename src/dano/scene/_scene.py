@@ -245,11 +245,10 @@ class Scene(eqx.Module):
         Raises:
             ValueError: If there is no such body.
         """
-        if name not in self.names:
-            raise ValueError(
-                f"body must be one of {list(self.names)}, got {name!r}{did_you_mean(name, self.names)}"
-            )
-        return self.names.index(name)
+        names = self.names
+        if name not in names:
+            raise ValueError(f"body must be one of {list(names)}, got {name!r}{did_you_mean(name, names)}")
+        return names.index(name)
 
     def body(self, name: str) -> Body:
         """A body by name.
@@ -417,7 +416,7 @@ class Scene(eqx.Module):
 
     def state_of(self, bodies: ByName, joint_names: Mapping[str, str] | None = None) -> State:
         """`initial_state` of bodies in a mapping, with names of joints for messages, by their bodies'."""
-        for name in bodies:
+        for name in set(bodies) - set(self.names):
             self.index(name)
         dtype = self.timestep.dtype
         given = started(self.bodies, bodies)

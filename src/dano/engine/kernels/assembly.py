@@ -3,11 +3,12 @@
 import warp as wp
 
 from dano.engine.kernels.lanes import total, total6, total66, wait
-from dano.engine.kernels.linear_solve import is_in, n_listed, touches
-from dano.engine.kernels.tables import FoundPair, Room, Scene
+from dano.engine.kernels.linear_solve import EVERYWHERE, ISLANDS, member, pair_at, part_of
+from dano.engine.kernels.tables import FoundPair, Island, Room, Scene
 from dano.engine.kernels.trees.balance import add_tree_momentum
 from dano.engine.kernels.trees.contact import add_pulled, body_twist, free_block
 from dano.engine.kernels.trees.loops import add_loops
+from dano.engine.kernels.trees.pattern import block_at
 from dano.physics.features import LANES, TREES
 from dano.physics.momentum import angular_momentum, angular_momentum_jacobian
 from dano.physics.pairs import FIXED
@@ -134,9 +135,9 @@ def pair_twist(
 @wp.func
 def fit_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, island: int):
     """Duals of an island that fit the accepted velocities."""
-    for f in range(n_found):
-        if not touches(scene, room, world, f, island):
-            continue
+    part = part_of(scene, room, world, n_found, island)
+    for e in range(part.first_pair, part.end_pair):
+        f = pair_at(room, world, island, e)
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.velocity, ONE)
         for k in range(found.first, found.end):
@@ -163,9 +164,9 @@ def follow_duals(
     island: int,
 ):
     """Accept the duals at a share of the last step; find their change along the new one, in `room.step`."""
-    for f in range(n_found):
-        if not touches(scene, room, world, f, island):
-            continue
+    part = part_of(scene, room, world, n_found, island)
+    for e in range(part.first_pair, part.end_pair):
+        f = pair_at(room, world, island, e)
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.step, ZERO)
         for k in range(found.first, found.end):
@@ -267,12 +268,10 @@ def whole_jacobian(sums: wp.ref[Halves]) -> mat66:
 
 
 @wp.func
-def clear_blocks(room: wp.ref[Room], world: int, lane: int, m: int, island: int):
+def clear_blocks(room: wp.ref[Room], world: int, lane: int, part: Island):
     """Zero the blocks in use of an island, each lane a part."""
-    for e in range(lane, n_listed(room, world, m), _LANES):
-        k = room.listed[world, e]
-        if is_in(room, world, k // m, island):
-            room.blocks[world, k] = mat66()
+    for k in range(part.first_block + lane, part.end_block, _LANES):
+        room.blocks[world, k] = mat66()
 
 
 @wp.func
@@ -280,11 +279,18 @@ def add_momentum(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, m: int, h: real, island: int
 ):
     """What momenta of bodies of an island gain in the step beyond what they come with, and the derivative."""
-    for i in range(lane, scene.moving.shape[0], _LANES):
+    first = int(0)
+    end = scene.moving.shape[0]
+    if wp.static(ISLANDS):
+        if island != EVERYWHERE:
+            first = room.parts[world, island].first
+            end = room.parts[world, island].end
+    for e in range(first + lane, end, _LANES):
+        i = member(room, world, island, e)
         b = i
         if wp.static(TREES):
             b = free_block(scene, i)
-        if b >= 0 and is_in(room, world, b, island):
+        if b >= 0:
             body = scene.bodies[world, scene.moving[i]]
             v = room.tried[world, b]
             spin = angular_part(v)
@@ -295,7 +301,8 @@ def add_momentum(
             room.residual[world, b] = joined(linear, angular) - room.momentum[world, i]
             eye = wp.identity(n=3, dtype=real)
             turning = angular_momentum_jacobian(spin, inertia, h, lead)
-            room.blocks[world, b * m + b] = joined_blocks(body.mass * eye, mat33(), mat33(), turning)
+            own = joined_blocks(body.mass * eye, mat33(), mat33(), turning)
+            room.blocks[world, block_at(room, world, m, b, b)] = own
 
 
 @wp.func
@@ -317,16 +324,16 @@ def add_contact(
         return
     if a >= 0:
         room.residual[world, a] -= wrench
-        room.blocks[world, a * m + a] -= jacobian
+        room.blocks[world, block_at(room, world, m, a, a)] -= jacobian
     if b >= 0:
         t = shift(found.com_difference)
         back = wp.transpose(t)
         room.residual[world, b] += back * wrench
         by_second = jacobian * t
-        room.blocks[world, b * m + b] -= back * by_second
+        room.blocks[world, block_at(room, world, m, b, b)] -= back * by_second
         if a >= 0:
-            room.blocks[world, a * m + b] += by_second
-            room.blocks[world, b * m + a] += back * jacobian
+            room.blocks[world, block_at(room, world, m, a, b)] += by_second
+            room.blocks[world, block_at(room, world, m, b, a)] += back * jacobian
 
 
 @wp.func(inline=True)
@@ -335,7 +342,8 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
     h = scene.timestep[world, 0]
     m = scene.n_blocks
     fit = Fit()
-    clear_blocks(room, world, lane, m, island)
+    part = part_of(scene, room, world, n_found, island)
+    clear_blocks(room, world, lane, part)
     wait()
     add_momentum(scene, room, world, lane, m, h, island)
     wait()
@@ -343,9 +351,8 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
         if wp.static(TREES):
             add_tree_momentum(scene, room, world, trial.length)
         add_loops(scene, room, world)
-    for f in range(n_found):
-        if not touches(scene, room, world, f, island):
-            continue
+    for e in range(part.first_pair, part.end_pair):
+        f = pair_at(room, world, island, e)
         found = room.found[world, f * _LANES + lane]
         twist = pair_twist(scene, room, world, found, room.tried, ONE)
         sums = Halves()

@@ -13,7 +13,7 @@ from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.physics.features import LANES, TREES
 from dano.physics.momentum import turned_inertia
 from dano.physics.pairs import FIXED, rotation_met
-from dano.physics.real import HALF, mat66, ONE, real, vec3, vec6, ZERO
+from dano.physics.real import HALF, mat66, ONE, vec3, vec6, ZERO
 from dano.physics.twists import angular_part, joined, linear_part, wrench_at
 
 _LANES, _FIXED = wp.constant(LANES), wp.constant(FIXED)
@@ -46,28 +46,9 @@ def pair_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: Foun
 
 
 @wp.func
-def waits_on(scene: wp.ref[Scene], found: FoundPair, body: int) -> bool:
-    """Whether impulses of a pair on a body wait for when it meets the other."""
-    index = scene.pair_index[found.pair]
-    first = found.first_waits > 0 and index.first == body
-    return found.impact.delays > ZERO and (first or (found.second_waits > 0 and index.second == body))
-
-
-@wp.func
-def meetings_of(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, body: int
-) -> tuple[real, real, real]:
+def meetings_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int) -> vec3:
     """How many impulses on a body wait for when it meets another, by how much, and the sum of moments τ_β."""
-    count = real(0.0)
-    waits = real(0.0)
-    shares = real(0.0)
-    for f in range(n_found):
-        found = room.found[world, f * _LANES]
-        if waits_on(scene, found, body):
-            count += ONE
-            waits += found.impact.delays
-            shares += found.impact.delays * found.share
-    return count, waits, shares
+    return room.meetings[world, scene.body_index[body].row]
 
 
 @wp.func
@@ -110,16 +91,26 @@ def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_fou
     Of impulses that take effect at several moments the mean counts. Everything is right to first order in h
     for any of them.
     """
+    for i in range(scene.moving.shape[0]):
+        room.meetings[world, i] = vec3()
     for f in range(n_found):
-        found = room.found[world, f * _LANES]
-        if wp.length_sq(found.support) > ZERO:
-            add_support(scene, room, world, found)
+        delays = room.found[world, f * _LANES].impact.delays
+        if delays > ZERO:
+            found = room.found[world, f * _LANES]
+            if wp.length_sq(found.support) > ZERO:
+                add_support(scene, room, world, found)
+            index = scene.pair_index[found.pair]
+            waits = vec3(ONE, delays, delays * found.share)
+            if found.first_waits > 0:
+                room.meetings[world, scene.body_index[index.first].row] += waits
+            if found.second_waits > 0:
+                room.meetings[world, scene.body_index[index.second].row] += waits
     for i in range(scene.moving.shape[0]):
         body = scene.moving[i]
-        count, waits, shares = meetings_of(scene, room, world, n_found, body)
-        if count > ZERO:
-            room.bodies[world, body].met = shares / count
-            room.bodies[world, body].lead = ONE - waits / count
+        met = meetings_of(scene, room, world, body)
+        if met[0] > ZERO:
+            room.bodies[world, body].met = met[2] / met[0]
+            room.bodies[world, body].lead = ONE - met[1] / met[0]
             rotation = rotation_met(room.bodies[world, body])
             room.inertia[world, i] = turned_inertia(rotation, scene.bodies[world, body].inertia)
 

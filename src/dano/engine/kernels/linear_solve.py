@@ -11,8 +11,15 @@ pivots stay away from singular.
 import warp as wp
 
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.tables import Room, Scene
-from dano.engine.kernels.trees.pattern import couple, couple_pair, couple_trees, mark_tree, mark_trees
+from dano.engine.kernels.tables import Island, Room, Scene
+from dano.engine.kernels.trees.pattern import (
+    block_at,
+    couple,
+    couple_pair,
+    couple_trees,
+    mark_tree,
+    mark_trees,
+)
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.real import mat33, mat66, real, vec6
 from dano.physics.twists import joined_blocks
@@ -25,32 +32,101 @@ EVERYWHERE = wp.constant(-1)
 
 
 @wp.func
-def is_in(room: wp.ref[Room], world: int, row: int, island: int) -> bool:
-    """Whether a block belongs to an island."""
-    return island == EVERYWHERE or room.islands[world, row] == island
+def part_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, island: int) -> Island:
+    """Places of what belongs to an island, or of all: see `member` and `pair_at`."""
+    part = Island()
+    if island == EVERYWHERE:
+        part.end = scene.n_blocks
+        part.end_pair = n_found
+        part.end_block = room.lasting[world, 0].blocks
+    else:
+        part = room.parts[world, island]
+    return part
 
 
 @wp.func
-def touches(scene: wp.ref[Scene], room: wp.ref[Room], world: int, f: int, island: int) -> bool:
-    """Whether a pair that is near belongs to an island: of its bodies at least one moves."""
-    if island == EVERYWHERE:
-        return True
-    index = scene.pair_index[room.found[world, f].pair]
+def member(room: wp.ref[Room], world: int, island: int, place: int) -> int:
+    """The block of unknowns at a place."""
+    if wp.static(ISLANDS):
+        if island != EVERYWHERE:
+            return room.members[world, place]
+    return place
+
+
+@wp.func
+def pair_at(room: wp.ref[Room], world: int, island: int, place: int) -> int:
+    """The pair with points at a place."""
+    if wp.static(ISLANDS):
+        if island != EVERYWHERE:
+            return room.sorted_pairs[world, place]
+    return place
+
+
+@wp.func
+def forget_blocks(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int):
+    """Have all blocks found anew: nothing is known of what the room holds."""
+    if lane == 0:
+        for k in range(scene.n_blocks * scene.n_blocks):
+            room.used[world, k] = 0
+        room.lasting[world, 0].blocks = 0
+
+
+@wp.func
+def find_islands(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int):
+    """Which blocks and pairs belong to which island, in their order; its number is its first one's."""
+    m = scene.n_blocks
+    for i in range(m):
+        room.islands[world, i] = -1
+    for i in range(m):
+        if room.islands[world, i] < 0:
+            room.islands[world, i] = i
+            room.parts[world, i] = Island()
+            room.members[world, 0] = i
+            waiting = int(1)
+            while waiting > 0:
+                waiting -= 1
+                k = room.members[world, waiting]
+                room.parts[world, i].end = room.parts[world, i].end + 1
+                for e in range(room.neighbours[world, k]):
+                    j = room.beside[world, k * m + e]
+                    if room.islands[world, j] < 0:
+                        room.islands[world, j] = i
+                        room.members[world, waiting] = j
+                        waiting += 1
+    for f in range(n_found):
+        island = island_of(scene, room, world, f)
+        room.parts[world, island].end_pair = room.parts[world, island].end_pair + 1
+    first = int(0)
+    first_pair = int(0)
+    for i in range(m):
+        if room.islands[world, i] == i:
+            part = room.parts[world, i]
+            room.parts[world, i].first = first
+            room.parts[world, i].first_pair = first_pair
+            room.parts[world, i].end = first
+            room.parts[world, i].end_pair = first_pair
+            first += part.end
+            first_pair += part.end_pair
+    for i in range(m):
+        island = room.islands[world, i]
+        at = room.parts[world, island].end
+        room.members[world, at] = i
+        room.parts[world, island].end = at + 1
+    for f in range(n_found):
+        island = island_of(scene, room, world, f)
+        at = room.parts[world, island].end_pair
+        room.sorted_pairs[world, at] = f
+        room.parts[world, island].end_pair = at + 1
+
+
+@wp.func
+def island_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, f: int) -> int:
+    """The island of a pair that is near: of its bodies at least one moves."""
+    index = scene.pair_index[room.found[world, f * _LANES].pair]
     a = scene.body_index[index.first].row
     if a < 0:
         a = scene.body_index[index.second].row
-    return room.islands[world, a] == island
-
-
-@wp.func
-def join(room: wp.ref[Room], world: int, m: int, a: int, b: int):
-    """Make one island of those of two blocks, with the number of its first block."""
-    first = wp.min(room.islands[world, a], room.islands[world, b])
-    last = wp.max(room.islands[world, a], room.islands[world, b])
-    if first < last:
-        for i in range(last, m):
-            if room.islands[world, i] == last:
-                room.islands[world, i] = first
+    return room.islands[world, a]
 
 
 @wp.func
@@ -60,11 +136,11 @@ def find_pattern(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: 
     Trees that touch nothing are not in it: see `dano.engine.kernels.trees.factor`.
     """
     m = scene.n_blocks
-    for k in range(m * m):
-        room.used[world, k] = 0
+    for e in range(room.lasting[world, 0].blocks):
+        room.used[world, room.listed[world, e]] = 0
     for i in range(m):
         room.used[world, i * m + i] = 1
-        room.islands[world, i] = i
+        room.neighbours[world, i] = 0
     if wp.static(TREES):
         mark_trees(scene, room, world)
     for f in range(n_found):
@@ -77,24 +153,41 @@ def find_pattern(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: 
             mark_tree(scene, room, world, b)
         elif a >= 0 and b >= 0:
             couple(room, world, m, a, b)
-            join(room, world, m, a, b)
     for i in range(m):
         room.counts[world, i] = -1
         room.order[world, i] = -1
+    room.lasting[world, 0].blocks = 0
     if wp.static(TREES):
         couple_trees(scene, room, world)
     begin_degrees(scene, room, world, m)
-    for step in range(m):
+    if wp.static(ISLANDS):
+        find_islands(scene, room, world, n_found)
+        for i in range(m):
+            if room.islands[world, i] == i:
+                part = room.parts[world, i]
+                room.parts[world, i].first_block = room.lasting[world, 0].blocks
+                order_blocks(room, world, m, part.first, part.end, i)
+                list_blocks(room, world, m, part.first, part.end, i)
+                room.parts[world, i].end_block = room.lasting[world, 0].blocks
+    else:
+        order_blocks(room, world, m, 0, m, EVERYWHERE)
+        list_blocks(room, world, m, 0, m, EVERYWHERE)
+
+
+@wp.func
+def order_blocks(room: wp.ref[Room], world: int, m: int, first: int, end: int, island: int):
+    """Eliminate the blocks of an island: always one that is coupled with the fewest others."""
+    for step in range(first, end):
         best = int(-1)
         fewest = 2 * m + 1
-        for i in range(m):
+        for e in range(first, end):
+            i = member(room, world, island, e)
             if room.counts[world, i] < 0 and room.degrees[world, i] < fewest:
                 fewest = room.degrees[world, i]
                 best = i
         if best >= 0:
             room.order[world, step] = best
             eliminate(room, world, m, best)
-    list_blocks(room, world, m)
 
 
 @wp.func
@@ -105,19 +198,30 @@ def begin_degrees(scene: wp.ref[Scene], room: wp.ref[Room], world: int, m: int):
         if wp.static(TREES):
             # Forces in loops have nothing on the diagonal before all that they push is eliminated.
             degree = m * scene.trees.blocks[i].is_loop
-        for j in range(m):
-            if room.counts[world, j] < 0 and j != i:
-                degree += room.used[world, i * m + j]
+        for e in range(room.neighbours[world, i]):
+            if room.counts[world, room.beside[world, i * m + e]] < 0:
+                degree += 1
         room.degrees[world, i] = degree
+
+
+@wp.func
+def put_sorted(list: wp.array2d(dtype=wp.int32), world: int, first: int, n: int, value: int):
+    """Put a number into a list that is sorted, of n others."""
+    at = int(n)
+    while at > 0 and list[world, first + wp.max(at - 1, 0)] > value:
+        list[world, first + at] = list[world, first + at - 1]
+        at -= 1
+    list[world, first + at] = value
 
 
 @wp.func
 def eliminate(room: wp.ref[Room], world: int, m: int, best: int):
     """List the later neighbours of a block, which its elimination couples with each other."""
     n = int(0)
-    for j in range(m):
-        if j != best and room.counts[world, j] < 0 and room.used[world, best * m + j] > 0:
-            room.later[world, best * m + n] = j
+    for e in range(room.neighbours[world, best]):
+        j = room.beside[world, best * m + e]
+        if room.counts[world, j] < 0:
+            put_sorted(room.later, world, best * m, n, j)
             room.degrees[world, j] = room.degrees[world, j] - 1
             n += 1
     room.counts[world, best] = n
@@ -132,23 +236,24 @@ def eliminate(room: wp.ref[Room], world: int, m: int, best: int):
 
 
 @wp.func
-def list_blocks(room: wp.ref[Room], world: int, m: int):
-    """List the blocks in use, row by row."""
-    n = int(0)
-    for i in range(m):
-        for j in range(m):
-            if room.used[world, i * m + j] > 0:
-                room.listed[world, n] = i * m + j
-                n += 1
+def list_blocks(room: wp.ref[Room], world: int, m: int, first: int, end: int, island: int):
+    """Give the blocks of an island that are in use their places, row by row."""
+    n = room.lasting[world, 0].blocks
+    for e in range(first, end):
+        i = member(room, world, island, e)
+        room.begins[world, i] = n
+        count = int(0)
+        if room.used[world, i * m + i] > 0:
+            room.listed[world, n] = i * m + i
+            count = 1
+        for k in range(room.neighbours[world, i]):
+            put_sorted(room.listed, world, n, count, i * m + room.beside[world, i * m + k])
+            count += 1
+        for k in range(n, n + count):
+            room.used[world, room.listed[world, k]] = k + 1
+        n += count
         room.ends[world, i] = n
-
-
-@wp.func
-def n_listed(room: wp.ref[Room], world: int, row: int) -> int:
-    """Number of blocks in use in the rows before one: where those of a row begin in the list."""
-    if row == 0:
-        return 0
-    return room.ends[world, row - 1]
+    room.lasting[world, 0].blocks = n
 
 
 @wp.func
@@ -179,34 +284,45 @@ def solve_blocks(room: wp.ref[Room], world: int, lane: int, m: int, island: int)
 
     Both have to be known to all lanes; the solution is known to the first.
     """
-    for s in range(m):
+    first = int(0)
+    end = int(m)
+    if wp.static(ISLANDS):
+        if island != EVERYWHERE:
+            first = room.parts[world, island].first
+            end = room.parts[world, island].end
+    for s in range(first, end):
         k = room.order[world, s]
-        if k >= 0 and is_in(room, world, k, island):
+        if k >= 0:
             n = room.counts[world, k]
+            own = block_at(room, world, m, k, k)
             if lane == 0:
-                room.spare[world, k * m + k] = inverse(room.spare[world, k * m + k])
+                room.spare[world, own] = inverse(room.spare[world, own])
             wait()
             for a in range(lane, n, _LANES):
                 i = room.later[world, k * m + a]
-                below = room.spare[world, i * m + k] * room.spare[world, k * m + k]
-                room.spare[world, i * m + k] = below
+                at = block_at(room, world, m, i, k)
+                below = room.spare[world, at] * room.spare[world, own]
+                room.spare[world, at] = below
                 room.step[world, i] = room.step[world, i] - below * room.step[world, k]
             wait()
             for e in range(lane, n * n, _LANES):
                 i = room.later[world, k * m + e // n]
                 j = room.later[world, k * m + e % n]
-                taken = room.spare[world, i * m + k] * room.spare[world, k * m + j]
-                room.spare[world, i * m + j] = room.spare[world, i * m + j] - taken
+                left = block_at(room, world, m, i, k)
+                right = block_at(room, world, m, k, j)
+                at = block_at(room, world, m, i, j)
+                taken = room.spare[world, left] * room.spare[world, right]
+                room.spare[world, at] = room.spare[world, at] - taken
             wait()
     if lane == 0:
-        for t in range(m):
-            k = room.order[world, m - 1 - t]
-            if k >= 0 and is_in(room, world, k, island):
+        for t in range(first, end):
+            k = room.order[world, end - 1 - t + first]
+            if k >= 0:
                 x = room.step[world, k]
                 for a in range(room.counts[world, k]):
                     i = room.later[world, k * m + a]
-                    x -= room.spare[world, k * m + i] * room.step[world, i]
-                room.step[world, k] = room.spare[world, k * m + k] * x
+                    x -= room.spare[world, block_at(room, world, m, k, i)] * room.step[world, i]
+                room.step[world, k] = room.spare[world, block_at(room, world, m, k, k)] * x
 
 
 @wp.func
@@ -237,29 +353,34 @@ def absolute_product(room: wp.ref[Room], world: int, block: int, v: vec6) -> vec
 def copy_rows(
     room: wp.ref[Room],
     world: int,
-    m: int,
+    part: Island,
     island: int,
     values: wp.array2d(dtype=vec6),
     into: wp.array2d(dtype=vec6),
 ):
     """Copy numbers of an island."""
-    for i in range(m):
-        if is_in(room, world, i, island):
-            into[world, i] = values[world, i]
+    for e in range(part.first, part.end):
+        i = member(room, world, island, e)
+        into[world, i] = values[world, i]
 
 
 @wp.func
 def copy_blocks(room: wp.ref[Room], world: int, lane: int, m: int, island: int):
     """Copy the Jacobian of an island into `spare`, each lane a part."""
-    for e in range(lane, n_listed(room, world, m), _LANES):
-        k = room.listed[world, e]
-        if is_in(room, world, k // m, island):
-            room.spare[world, k] = room.blocks[world, k]
+    first = int(0)
+    end = room.lasting[world, 0].blocks
+    if wp.static(ISLANDS):
+        if island != EVERYWHERE:
+            first = room.parts[world, island].first_block
+            end = room.parts[world, island].end_block
+    for k in range(first + lane, end, _LANES):
+        room.spare[world, k] = room.blocks[world, k]
 
 
 @wp.func
 def copy_transposed_blocks(room: wp.ref[Room], world: int, lane: int, m: int):
     """Copy the transpose of the Jacobian into `spare`, each lane a part."""
-    for e in range(lane, n_listed(room, world, m), _LANES):
-        k = room.listed[world, e]
-        room.spare[world, (k % m) * m + k // m] = wp.transpose(room.blocks[world, k])
+    for k in range(lane, room.lasting[world, 0].blocks, _LANES):
+        place = room.listed[world, k]
+        at = block_at(room, world, m, place % m, place // m)
+        room.spare[world, at] = wp.transpose(room.blocks[world, k])

@@ -78,7 +78,7 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
             row = ListedPoint()
             row.first = real(index.first)
             row.second = real(index.second)
-            row.contact = real(index.contact)
+            row.contact = real(index.number)
             row.sample = real(room.where[world, k].sample)
             row.share = found.share
             row.impact_share = found.impact.share

@@ -4,10 +4,12 @@ import warp as wp
 
 from dano.engine.kernels.impacts import balance_when_met, find_moved
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.linear_solve import find_pattern
+from dano.engine.kernels.linear_solve import find_pattern, forget_blocks
 from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
+from dano.engine.kernels.sleep import fall_asleep, is_at_rest, sleeps, wake, wake_all
 from dano.engine.kernels.solve import Options, solve, Solved
+from dano.engine.kernels.sweep import forget_candidates
 from dano.engine.kernels.tables import Push, Room, Scene, StateRow, StepReport
 from dano.engine.kernels.trees.balance import begin_joints, begin_trees
 from dano.engine.kernels.trees.contact import free_block
@@ -22,7 +24,7 @@ from dano.engine.kernels.trees.loops import begin_loops, forces_of
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
 from dano.physics.pairs import BodyState, rotation_met
-from dano.physics.real import HALF, ONE, real, vec6, ZERO
+from dano.physics.real import HALF, ONE, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.trees.joints import ROOT
 from dano.physics.twists import angular_part, joined, linear_part
@@ -276,10 +278,36 @@ def begin_step_of_trees(scene: wp.ref[Scene], room: wp.ref[Room], world: int, la
 
 
 @wp.func
+def forget(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int):
+    """Forget what is kept from step to step: a launch begins."""
+    forget_candidates(scene, room, world, lane)
+    forget_blocks(scene, room, world, lane)
+    wake_all(scene, room, world)
+
+
+@wp.func
+def stays_asleep(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, launch: wp.ref[Launch], t: int, i: int, push: Push
+) -> bool:
+    """Whether a body goes on to sleep: with the push of the step before; else its island wakes."""
+    row = scene.body_index[i].row
+    if not sleeps(room, world, row):
+        return False
+    before = push_of(scene, launch, world, wp.max(t - 1, 0), i)
+    if before.force == push.force and before.torque == push.torque:
+        return True
+    wake(scene, room, world, row)
+    return False
+
+
+@wp.func
 def begin_unpushed(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, launch: wp.ref[Launch], t: int
 ):
     """What is known at the start of a step that was not, or need not be, pushed."""
+    if t == 0 or t == launch.n_steps - 1:
+        # A launch begins with one of these.
+        forget(scene, room, world, lane)
     for i in range(scene.body_index.shape[0]):
         push = Push()
         begin_body(scene, room, world, i, row_before(scene, launch, world, t, i), push)
@@ -357,12 +385,15 @@ def rollout(scene: Scene, room: Room, launch: Launch):
     block, lane = wp.tid()
     world = launch.first_world + block
     n = scene.body_index.shape[0]
+    forget(scene, room, world, lane)
     for t in range(launch.n_steps):
         size = real(0.0)
         for i in range(n):
             row = row_before(scene, launch, world, t, i)
             push = push_of(scene, launch, world, t, i)
-            size = wp.max(size, begin_body(scene, room, world, i, row, push))
+            if not stays_asleep(scene, room, world, launch, t, i, push):
+                room.sizes[world, i] = begin_body(scene, room, world, i, row, push)
+            size = wp.max(size, room.sizes[world, i])
         wait()
         if wp.static(TREES):
             if lane == 0:
@@ -414,9 +445,15 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 if turns_too_far(scene, room, world):
                     report.solved = ZERO
             launch.reports[world, t] = report
+            fall_asleep(scene, room, world, solved.converged)
             for i in range(n):
                 row = row_before(scene, launch, world, t, i)
-                launch.states[world, t * n + i] = advance_body(scene, room, world, i, row)
+                if is_at_rest(room, world, scene.body_index[i].row):
+                    row.velocity = vec3()
+                    row.omega = vec3()
+                else:
+                    row = advance_body(scene, room, world, i, row)
+                launch.states[world, t * n + i] = row
             if wp.static(TREES):
                 advance_trees(scene, room, world, launch, t)
         wait()

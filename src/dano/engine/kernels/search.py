@@ -1,12 +1,13 @@
 """Finding contact: from poses and velocities to a list of point contacts (docs/theory/contact.md).
 
-Three filters, each more precise and more expensive: balls around bodies; blocks of samples; samples. A sample
+Filters, each more precise and more expensive: a sweep over all bodies, whose result is kept between steps
+(`dano.engine.kernels.sweep`); balls around bodies; blocks of samples; samples. A sample
 is listed if the old velocities take it into the other body by the end of the step, or nearly.
 """
 
 import warp as wp
 
-from dano.engine.kernels.lanes import lanes_where, total, total3
+from dano.engine.kernels.lanes import lanes_where, total, total3, wait
 from dano.engine.kernels.meeting import Meeting, meeting
 from dano.engine.kernels.near import (
     as_they_meet,
@@ -21,10 +22,13 @@ from dano.engine.kernels.near import (
     solid_of_body,
     stretch_of,
 )
+from dano.engine.kernels.sleep import is_idle, wake_near
+from dano.engine.kernels.sweep import find_candidates, may_be_near
 from dano.engine.kernels.tables import (
     BLOCK,
     FoundPair,
     FoundPoint,
+    numbers_of,
     Room,
     RUN,
     SamplePair,
@@ -68,6 +72,8 @@ from dano.physics.solids.distances import solid_clearance, solid_distance
 from dano.physics.solids.grids import STEEPEST
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
+# What a body touches, besides one other.
+_NOTHING, _SEVERAL = wp.constant(-1), wp.constant(-2)
 
 
 @wp.func
@@ -270,7 +276,7 @@ def find_rest(
     """What a pair rests on when the step begins."""
     rest = Rest()
     index = scene.pair_index[p]
-    pair = scene.pairs[world, p]
+    pair = numbers_of(scene, world, p)
     samples = scene.body_index[index.first]
     bounce = scene.materials[world, index.contact].bounce
     solid = solid_of_body(scene, world, index.second)
@@ -356,18 +362,11 @@ def lasting_meeting(
 
 
 @wp.func
-def waits_for(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, body: int, other: int
-) -> int:
-    """1 where a body moves, and touches none but one other."""
-    waits = wp.where(scene.body_index[body].row >= 0, 1, 0)
-    for g in range(n_found):
-        index = scene.pair_index[room.found[world, g * _LANES + lane].pair]
-        if index.first == body and index.second != other:
-            waits = 0
-        if index.second == body and index.first != other:
-            waits = 0
-    return waits
+def note_partner(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int):
+    """Note that a body touches another one; of several, `_SEVERAL`."""
+    if scene.body_index[body].row >= 0:
+        before = room.partners[world, body]
+        room.partners[world, body] = wp.where(before == _NOTHING or before == other, other, _SEVERAL)
 
 
 @wp.func
@@ -377,6 +376,15 @@ def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_
     What is pressed from two sides would else go on by what one of them does until the other begins: in a
     corner that friction jams, the two impulses have no bound.
     """
+    wait()
+    if lane == 0:
+        for i in range(scene.body_index.shape[0]):
+            room.partners[world, i] = _NOTHING
+        for f in range(n_found):
+            index = scene.pair_index[room.found[world, f * _LANES].pair]
+            note_partner(scene, room, world, index.first, index.second)
+            note_partner(scene, room, world, index.second, index.first)
+    wait()
     h = scene.timestep[world, 0]
     for f in range(n_found):
         k = f * _LANES + lane
@@ -384,8 +392,8 @@ def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_
         if found.impact.delays > ZERO:
             first = scene.pair_index[found.pair].first
             second = scene.pair_index[found.pair].second
-            found.first_waits = waits_for(scene, room, world, lane, n_found, first, second)
-            found.second_waits = waits_for(scene, room, world, lane, n_found, second, first)
+            found.first_waits = wp.where(room.partners[world, first] == second, 1, 0)
+            found.second_waits = wp.where(room.partners[world, second] == first, 1, 0)
             if found.first_waits + found.second_waits == 0:
                 found.impact = delayed(found.impact, ZERO, found.share, h)
             a, b = as_they_meet(room.bodies[world, first], room.bodies[world, second], found, h)
@@ -406,7 +414,7 @@ def find_pair(
         Place of the next point in the list, which may lie beyond its end.
     """
     h = scene.timestep[world, 0]
-    pair = scene.pairs[world, p]
+    pair = numbers_of(scene, world, p)
     index = scene.pair_index[p]
     a = room.bodies[world, index.first]
     b = room.bodies[world, index.second]
@@ -518,11 +526,22 @@ def find_contacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
     end = at + per_lane
     n_found = int(0)
     overflow = bool(False)
-    for p in range(scene.pairs.shape[1]):
-        index = scene.pair_index[p]
-        a = room.bodies[world, index.first]
-        b = room.bodies[world, index.second]
-        if is_near(scene, world, a, b, index.first, index.second, scene.pairs[world, p].margin, h):
+    candidates = find_candidates(scene, room, world, lane)
+    wake_near(scene, room, world, candidates)
+    for c in range(wp.where(candidates < 0, scene.n_pressing, candidates)):
+        p = c
+        if candidates >= 0:
+            p = room.candidates[world, c]
+        near = not is_idle(scene, room, world, p)
+        if near and candidates >= 0:
+            near = may_be_near(scene, room, world, p)
+        if near:
+            index = scene.pair_index[p]
+            margin = scene.pairs[world, index.row].margin
+            a = room.bodies[world, index.first]
+            b = room.bodies[world, index.second]
+            near = is_near(scene, world, a, b, index.first, index.second, margin, h)
+        if near:
             begin = at
             at = find_pair(scene, room, world, lane, p, n_found, begin, end)
             if at > end:

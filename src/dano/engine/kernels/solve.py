@@ -25,13 +25,14 @@ from dano.engine.kernels.linear_solve import (
     copy_blocks,
     copy_rows,
     EVERYWHERE,
-    is_in,
     ISLANDS,
-    n_listed,
+    member,
+    part_of,
     solve_blocks,
     worse_of,
 )
 from dano.engine.kernels.patches import add_patches, any_sticks, fit_patch_duals, follow_patch_duals
+from dano.engine.kernels.sleep import sleeps
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import (
     add_tree_slopes,
@@ -197,16 +198,15 @@ def measure(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, isl
             found.work = of_joints.work
             found.error = of_joints.error
             found.size = wp.max(of_joints.size, room.trees.sizes[world, 1])
-    for i in range(lane, m, _LANES):
-        if not is_in(room, world, i, island):
-            continue
+    part = part_of(scene, room, world, 0, island)
+    for e in range(part.first + lane, part.end, _LANES):
+        i = member(room, world, island, e)
         found.work += wp.dot(room.step[world, i], room.residual[world, i])
         found.error = worse_of(found.error, room, world, i)
         scale = room.scale[world, i]
         size = vec6()
-        for e in range(n_listed(room, world, i), room.ends[world, i]):
-            k = room.listed[world, e]
-            size += absolute_product(room, world, k, room.tried[world, k % m])
+        for k in range(room.begins[world, i], room.ends[world, i]):
+            size += absolute_product(room, world, k, room.tried[world, room.listed[world, k] % m])
         for c in range(6):
             found.size = wp.max(found.size, scale[c] * size[c])
     found.work = total(found.work)
@@ -239,9 +239,10 @@ def newton_step(scene: Scene, room: Room, world: int, lane: int, share: real, ke
     """
     m = scene.n_blocks
     copy_blocks(room, world, lane, m, island)
-    for i in range(lane, m, _LANES):
-        if is_in(room, world, i, island):
-            room.step[world, i] = -room.residual[world, i]
+    part = part_of(scene, room, world, 0, island)
+    for e in range(part.first + lane, part.end, _LANES):
+        i = member(room, world, island, e)
+        room.step[world, i] = -room.residual[world, i]
     wait()
     if wp.static(TREES):
         if lane == 0:
@@ -251,9 +252,9 @@ def newton_step(scene: Scene, room: Room, world: int, lane: int, share: real, ke
     if lane == 0:
         if wp.static(TREES):
             solve_trees(scene, room, world, keeps)
-        for i in range(m):
-            if is_in(room, world, i, island):
-                room.step[world, i] = share * room.step[world, i]
+        for e in range(part.first, part.end):
+            i = member(room, world, island, e)
+            room.step[world, i] = share * room.step[world, i]
 
 
 @wp.func(inline=True)
@@ -272,12 +273,12 @@ def solve_island(
         options: When to stop.
         island: Which bodies.
     """
-    m = scene.n_blocks
+    places = part_of(scene, room, world, n_found, island)
     if lane == 0:
-        for i in range(m):
-            if is_in(room, world, i, island):
-                room.best[world, i] = room.velocity[world, i]
-                room.step[world, i] = vec6()
+        for e in range(places.first, places.end):
+            i = member(room, world, island, e)
+            room.best[world, i] = room.velocity[world, i]
+            room.step[world, i] = vec6()
         if wp.static(TREES):
             fit_joint_duals(scene, room, world)
     fit_duals(scene, room, world, lane, n_found, island)
@@ -313,9 +314,9 @@ def solve_island(
     while not found.converged and found.passes < options.max_passes and number < _LEVELS:
         wait()
         if lane == 0:
-            for i in range(m):
-                if is_in(room, world, i, island):
-                    room.tried[world, i] = room.velocity[world, i] + search.length * room.step[world, i]
+            for e in range(places.first, places.end):
+                i = member(room, world, island, e)
+                room.tried[world, i] = room.velocity[world, i] + search.length * room.step[world, i]
         wait()
         trial = Trial()
         trial.length = search.length
@@ -391,7 +392,7 @@ def solve_island(
             search = narrowed(search, seen.work)
         else:
             if lane == 0:
-                copy_rows(room, world, m, island, room.tried, room.velocity)
+                copy_rows(room, world, places, island, room.tried, room.velocity)
             if wp.static(TREES):
                 if n_near == 0 and found.converged and seen.error > _EXACT * options.rounding * (ONE + size):
                     # A last step, not looked at, takes what is left to rounding.
@@ -412,20 +413,20 @@ def solve_island(
                 if mix == ZERO:
                     if wp.static(TREES):
                         begun = measure_joints(scene, room, world).work
-                    for i in range(m):
-                        if is_in(room, world, i, island):
-                            begun += wp.dot(room.step[world, i], room.residual[world, i])
+                    for e in range(places.first, places.end):
+                        i = member(room, world, island, e)
+                        begun += wp.dot(room.step[world, i], room.residual[world, i])
                 search = begin_search(begun)
             before = seen.error
         if improves and lane == 0:
-            copy_rows(room, world, m, island, room.tried, room.best)
+            copy_rows(room, world, places, island, room.tried, room.best)
         found.passes += 1
     if not found.converged and lane == 0:
-        copy_rows(room, world, m, island, room.best, room.velocity)
+        copy_rows(room, world, places, island, room.best, room.velocity)
     if wp.static(TREES):
         if found.converged and lane == 0:
             if finishes:
-                for i in range(m):
+                for i in range(scene.n_blocks):
                     room.velocity[world, i] = room.velocity[world, i] + room.step[world, i]
                 finish_joint_duals(scene, room, world)
             resolve_joints(scene, room, world)
@@ -455,7 +456,7 @@ def solve(
         if wp.static(ISLANDS):
             island = room.islands[world, i]
         # An island has the number of its first body.
-        if island == EVERYWHERE or island == i:
+        if (island == EVERYWHERE or island == i) and not sleeps(room, world, i):
             one = solve_island(scene, room, world, lane, n_found, size, options, island)
             whole.residual = wp.max(whole.residual, one.residual)
             whole.passes = wp.max(whole.passes, one.passes)

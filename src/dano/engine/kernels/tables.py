@@ -75,11 +75,13 @@ class SamplePair:
 
 @wp.struct
 class PairIndex:
-    """Whole numbers of a pair: its bodies and its contact."""
+    """Whole numbers of a pair: its bodies, and where its numbers stand, which it shares with pairs alike."""
 
     first: wp.int32
     second: wp.int32
-    contact: wp.int32
+    contact: wp.int32  # Of `Scene.materials`, or number among the contacts with a patch law
+    row: wp.int32  # Of `Scene.pairs`, −1 where points do not press
+    number: wp.int32  # Of the contact among those of its kind of law
 
 
 @wp.struct
@@ -96,10 +98,13 @@ class Scene:
         slabs: Mean unit normal [F] of each block, and how far along it samples are from its centre [m].
         runs: Balls around each block and those after it, `RUN` in all.
         solids: What samples press on.
-        pairs: Shape (worlds, pairs).
-        pair_index: Shape (pairs + contacts with a patch law,): bodies and contact of each pair with samples
-            that press, then of each contact with a patch law, numbered among these.
-        materials: Of the contacts with point laws, shape (worlds, contacts).
+        n_pressing: Pairs with samples that press.
+        pairs: Of pairs that are not alike, shape (worlds, kinds of pairs).
+        pair_index: Shape (pairs + contacts with a patch law,): of each pair with samples that press, then of
+            each contact with a patch law.
+        partners: Of each body and each other the pair in which the first one's samples press on the other, −1
+            for none, shape (n · n,); no rows where all pairs are asked in each step.
+        materials: Of contacts with point laws that are not alike, shape (worlds, kinds of contacts).
         gravity: [m/s²], shape (worlds, 1).
         timestep: h [s], shape (worlds, 1).
         patches: Contacts with a patch law.
@@ -107,6 +112,7 @@ class Scene:
     """
 
     n_blocks: wp.int32
+    n_pressing: wp.int32
     bodies: wp.array2d(dtype=Body)
     body_index: wp.array(dtype=BodyIndex)
     moving: wp.array(dtype=wp.int32)
@@ -117,11 +123,40 @@ class Scene:
     solids: Solids
     pairs: wp.array2d(dtype=SamplePair)
     pair_index: wp.array(dtype=PairIndex)
+    partners: wp.array(dtype=wp.int32)
     materials: wp.array2d(dtype=Material)
     gravity: wp.array2d(dtype=vec3)
     timestep: wp.array2d(dtype=real)
     patches: PatchTables
     trees: Trees
+
+
+@wp.func
+def numbers_of(scene: wp.ref[Scene], world: int, pair: int) -> SamplePair:
+    """What is known of a pair with samples that press."""
+    return scene.pairs[world, scene.pair_index[pair].row]
+
+
+@wp.struct
+class Lasting:
+    """What is kept from one step to the next."""
+
+    candidates: wp.int32  # Pairs that may be near; −1 where they are not known
+    blocks: wp.int32  # Of the Jacobian that are in use
+    asleep: wp.int32  # Bodies that sleep
+    margin: real  # Largest of all pairs [m]
+
+
+@wp.struct
+class Island:
+    """Where lists have what belongs to bodies that touch, also through others: first, beyond last."""
+
+    first: wp.int32  # Of its blocks of unknowns
+    end: wp.int32
+    first_pair: wp.int32
+    end_pair: wp.int32
+    first_block: wp.int32  # Of those of the Jacobian
+    end_block: wp.int32
 
 
 @wp.struct
@@ -278,8 +313,15 @@ class Room:
         bodies: State of each body at the start of the step.
         momentum: That each moving body has before contact [kg m/s; kg m²/s, W].
         inertia: Of each moving body [kg m², W].
-        found: Pairs that are near, then those whose patches touch, shape (worlds, pairs · lanes) for all rows
-            of `Scene.pair_index`.
+        bounds: Centre of a ball around each body [m, W], and how far anything of it reaches from there within
+            the step [m]; only where candidates are kept.
+        kept: The same when candidates were listed, with room to move.
+        lasting: What else is kept, shape (worlds, 1).
+        sorted: Bodies along an axis.
+        marked: A bit for each pair that is a candidate.
+        candidates: Pairs that may be near.
+        partners: The body that a body touches, see `dano.engine.kernels.search`.
+        found: Pairs that are near, then those whose patches touch, shape (worlds, pairs · lanes).
         where: Of each point where it was found, shape (worlds, capacity).
         points: The points.
         laws: Their constants.
@@ -290,21 +332,31 @@ class Room:
         linear: The law as it was linearised last.
         near: Blocks whose samples may meet a solid within the step, of each lane a part.
         until: Share of the step before which none of such a block does.
-        blocks: Of the Jacobian, shape (worlds, blocks · blocks).
+        blocks: Of the Jacobian, those that are not zero, row by row, shape (worlds, blocks · blocks + 1).
         spare: The same, used up by the solve.
-        used: Whether a block is not zero.
+        used: Of each row and column the place of its block, from 1 on, or 0.
         order: Of elimination; later neighbours; their numbers.
         later: …
         counts: …
-        degrees: With how many others a block is coupled.
-    islands: First of the blocks with which a block is coupled, by others, too: see `linear_solve`.
-        listed: The blocks that are not zero, row by row.
-        ends: Where those of each row end in this list.
+        beside: With which others a block is coupled, and with how many.
+        neighbours: …
+        degrees: With how many that are to be eliminated.
+        islands: First of the blocks with which a block is coupled, by others, too: see `linear_solve`.
+        members: Blocks of unknowns, island by island.
+        sorted_pairs: Pairs with points, island by island.
+        parts: Where islands begin and end, by the first of their blocks.
+        rests: Whether bodies that move rest at the end of a step.
+        asleep: Number of the island that each of them sleeps with, −1 where it is awake.
+        sizes: Of the velocities that each body's momentum stands for [m/s].
+        listed: Row and column of each block of the Jacobian.
+        begins: Where those of each row begin and end.
+        ends: …
         velocity: Accepted, of each free body [m/s; rad/s, W], or six coordinates of joints; (worlds, blocks).
         old: Those of the step before; only with joints.
         tried: …
         best: Where the residual was smallest.
         moved: By which positions change within a step.
+        meetings: Of each moving body what waits for when it meets others, see `dano.engine.kernels.impacts`.
         late: Virtual velocities of impulses that take effect within a step.
         step: Of Newton's method.
         residual: What each block misses [kg m/s; kg m²/s, W].
@@ -327,6 +379,13 @@ class Room:
     bodies: wp.array2d(dtype=BodyState)
     momentum: wp.array2d(dtype=vec6)
     inertia: wp.array2d(dtype=mat33)
+    bounds: wp.array2d(dtype=vec4)
+    kept: wp.array2d(dtype=vec4)
+    lasting: wp.array2d(dtype=Lasting)
+    sorted: wp.array2d(dtype=wp.int32)
+    marked: wp.array2d(dtype=wp.uint32)
+    candidates: wp.array2d(dtype=wp.int32)
+    partners: wp.array2d(dtype=wp.int32)
     found: wp.array2d(dtype=FoundPair)
     where: wp.array2d(dtype=FoundPoint)
     points: wp.array2d(dtype=Point)
@@ -344,15 +403,25 @@ class Room:
     order: wp.array2d(dtype=wp.int32)
     later: wp.array2d(dtype=wp.int32)
     counts: wp.array2d(dtype=wp.int32)
+    beside: wp.array2d(dtype=wp.int32)
+    neighbours: wp.array2d(dtype=wp.int32)
     degrees: wp.array2d(dtype=wp.int32)
     islands: wp.array2d(dtype=wp.int32)
+    members: wp.array2d(dtype=wp.int32)
+    sorted_pairs: wp.array2d(dtype=wp.int32)
+    parts: wp.array2d(dtype=Island)
+    rests: wp.array2d(dtype=wp.int32)
+    asleep: wp.array2d(dtype=wp.int32)
+    sizes: wp.array2d(dtype=real)
     listed: wp.array2d(dtype=wp.int32)
+    begins: wp.array2d(dtype=wp.int32)
     ends: wp.array2d(dtype=wp.int32)
     velocity: wp.array2d(dtype=vec6)
     old: wp.array2d(dtype=vec6)
     tried: wp.array2d(dtype=vec6)
     best: wp.array2d(dtype=vec6)
     moved: wp.array2d(dtype=vec6)
+    meetings: wp.array2d(dtype=vec3)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
     scale: wp.array2d(dtype=vec6)

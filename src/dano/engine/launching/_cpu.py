@@ -129,7 +129,7 @@ class _Share:
     ):
         parameters = parameters_of(plan, kernel.layout, batched, n_worlds)
         parameters.put("launch.first_world", first)
-        for place, values in plan.whole.items():
+        for place, values in plan.whole.arrays.items():
             parameters.point(place, (values.shape[0],), (values.strides[0],), values.ctypes.data)
         sizes = [max(length, 1) * kernel.layout.arrays[place].item for place, length in plan.room.items()]
         begins = np.cumsum([0, *(-(-size // _ALIGNED) * _ALIGNED for size in sizes)])

@@ -29,7 +29,7 @@ _OF_POINTS = tuple(
     f"room.{name}"
     for name in ("near", "until", "where", "points", "laws", "gates", "marks", "duals", "changes", "linear")
 )
-_MORE_POINTS = 16
+MORE_POINTS = 16
 # Boundary of each array in the room [bytes].
 _ALIGNED = 16
 
@@ -53,7 +53,7 @@ def call(
     dtype = inputs[0].dtype
     build = Build(LANES, dtype == np.float64)
     places, size = _layout(plan, build)
-    whole = [np.ascontiguousarray(values, np.int32).reshape(-1) for values in plan.whole.values()]
+    whole = [np.ascontiguousarray(values, np.int32).reshape(-1) for values in plan.whole.arrays.values()]
     shapes = [jax.ShapeDtypeStruct((n_worlds, *shape), dtype) for shape in plan.outputs.values()]
     # Outputs to which a kernel adds are given as zeros, in place.
     zeros = [jnp.zeros(x.shape, x.dtype) for x in shapes] if plan.adds else []
@@ -74,7 +74,7 @@ def _layout(plan: Plan, build: Build) -> tuple[dict[str, tuple[int, int, int]], 
         if place in _OF_EACH_LANE:
             length *= build.lanes
         if place in _OF_POINTS and length > 0:
-            length = build.lanes * (-(-length // build.lanes) + _MORE_POINTS)
+            length = build.lanes * (-(-length // build.lanes) + MORE_POINTS)
         size = arrays[place].item
         places[place] = at, length, size
         at += -(-length * size // _ALIGNED) * _ALIGNED
@@ -147,13 +147,13 @@ class _Blocks:
         self._parameters = parameters = parameters_of(
             plan, plan.layout(build), batched, n_worlds, wide=build.wide
         )
-        for place, values in plan.whole.items():
+        for place, values in plan.whole.arrays.items():
             parameters.point(place, (values.shape[0],), (parameters.layout.arrays[place].item,))
         places, size = _layout(plan, build)
         for place, (_, length, item) in places.items():
             parameters.point(place, (n_worlds, length), (size, item))
         self._arrays = given_arrays(plan, parameters, wide=build.wide)
-        self._whole = [parameters.array(place) for place in plan.whole]
+        self._whole = [parameters.array(place) for place in plan.whole.arrays]
         self._room = [(parameters.array(place), at) for place, (at, _, _) in places.items()]
         self._gradients = []
         for place, (of, bars) in plan.views_of_room.items():

@@ -114,7 +114,7 @@ def patch_tables(
         ValueError: If kernels do not know a law or a field, or a pair has nothing to sum over.
     """
     if not pairs:
-        return PatchTables({}, {}, [], _integers([], 3), False)
+        return PatchTables({}, {}, [], _integers([], 5), False)
     samples, fields = _Samples(dtype, twins), _Fields(dtype, n_leaves, twins)
     contacts, materials, sides, side_index, index = [], [], [], [], []
     for k, pair in enumerate(pairs):
@@ -124,7 +124,7 @@ def patch_tables(
         materials.append(law.numbers(pair.params).astype(dtype))
         sides += [row for row, _ in own]
         side_index += [row for _, row in own]
-        index.append((pair.first, pair.second, k))
+        index.append((pair.first, pair.second, k, -1, k))
     rows = {
         "scene.patches.materials": jnp.stack(materials),
         "scene.patches.sides": jnp.stack(sides),
@@ -140,7 +140,7 @@ def patch_tables(
         rows,
         whole,
         fields.leaves,
-        _integers(index, 3),
+        _integers(index, 5),
         fields.unions,
     )
 

@@ -1,5 +1,6 @@
 """Launches but for their real numbers: which kernel, what it reads and writes, and where."""
 
+import functools
 import hashlib
 import threading
 from typing import Any, NamedTuple
@@ -39,6 +40,32 @@ class View(NamedTuple):
     gradient: str = ""  # Place of an output with the derivatives by it, at the same numbers; empty for none
 
 
+class Whole:
+    """Whole numbers of a scene by place in a kernel's parameters, on the host.
+
+    Attributes:
+        arrays: The numbers, which nothing changes.
+    """
+
+    def __init__(self, arrays: dict[str, np.ndarray]):
+        """See the class."""
+        self.arrays = arrays
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """A name of the numbers: those of many pairs would take long to compare in each call."""
+        found = hashlib.sha256()
+        for name, values in self.arrays.items():
+            found.update(repr((name, values.shape, values.dtype.str)).encode())
+            found.update(np.ascontiguousarray(values))
+        return found.hexdigest()
+
+    @functools.cached_property
+    def n_pressing(self) -> int:
+        """Pairs with samples that press."""
+        return int((self.arrays["scene.pair_index"][:, 3] >= 0).sum())
+
+
 class Plan:
     """A launch but for its real numbers.
 
@@ -48,7 +75,7 @@ class Plan:
         features: What it must know.
         inputs: Place of each input in the kernel's parameters, such as "scene.bodies", and its shape.
         outputs: The same of the outputs.
-        whole: Arrays of whole numbers, the same for all worlds, by place.
+        whole: Whole numbers, the same for all worlds.
         room: Lengths of the arrays that a world of one lane works in, by place.
         numbers: Other fields of the parameters, by place, some of them `OfWidth`.
         views: Arrays that are parts of outputs, by place.
@@ -61,15 +88,15 @@ class Plan:
         features: Features,
         inputs: dict[str, Shape],
         outputs: dict[str, Shape],
-        whole: dict[str, np.ndarray],
+        whole: Whole,
         room: dict[str, int],
         numbers: dict[str, Any],
         views: dict[str, View],
     ):
         """See the class."""
         self.module, self.kernel, self.features = module, kernel, features
-        self.inputs, self.outputs, self.whole, self.room, self.numbers = inputs, outputs, whole, room, numbers
-        self.views = views
+        self.inputs, self.outputs, self.room, self.numbers = inputs, outputs, room, numbers
+        self.whole, self.views = whole, views
         self._compiled: set[tuple[Build, str]] = set()
         self._layouts: dict[Build, Layout] = {}
 
@@ -81,8 +108,7 @@ class Plan:
         """
         told = [self.module, self.features.values, self.inputs, self.outputs, self.room, self.numbers]
         told += [self.views, *more]
-        whole = {name: (values.shape, values.tobytes()) for name, values in self.whole.items()}
-        digest = hashlib.sha256(repr((told, whole)).encode()).hexdigest()[:24]
+        digest = hashlib.sha256(repr((told, self.whole.digest)).encode()).hexdigest()[:24]
         return f"dano_{self.kernel}_{digest}"
 
     @property
@@ -141,7 +167,7 @@ def plan(
     features: Features,
     inputs: dict[str, Shape],
     outputs: dict[str, Shape],
-    whole: dict[str, np.ndarray],
+    whole: Whole,
     room: dict[str, int],
     numbers: dict[str, Any],
     views: dict[str, View] | None = None,
@@ -153,7 +179,7 @@ def plan(
         features,
         tuple(inputs.items()),
         tuple(outputs.items()),
-        tuple((name, x.shape, x.tobytes()) for name, x in whole.items()),
+        whole.digest,
         tuple(room.items()),
         tuple(numbers.items()),
         tuple((views or {}).items()),

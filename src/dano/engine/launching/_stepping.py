@@ -13,6 +13,7 @@ from dano.engine._compiling import by_numpy_on_cpus
 from dano.engine._reports import Report, SolverOptions
 from dano.engine.joints import tree_lengths
 from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
+from dano.engine.launching._cuda import LANES, MORE_POINTS
 from dano.engine.launching._launch import launch, OfWidth, Plan, plan, Shape
 from dano.engine.launching._tables import Tables
 from dano.maths import AnyArray, library
@@ -33,6 +34,8 @@ _POINT = {
 }
 _POINT |= {"arm": 3, "normal": 3, "moment": 3, "extra_slip": 3}
 _POINT |= {"depth": 1, "rate": 1, "approach": 1, "meets": 1, "gains_after": 3, "area": 1, "sunk": 1}
+# Pairs that lanes of a GPU find beyond the room for points of a CPU, of which each has some more, and one.
+_MORE_FOUND = LANES * (MORE_POINTS + 1)
 _PATCHES = tuple(
     f"room.patches.{name}"
     for name in ("patches", "arms", "duals", "changes", "linear", "wrenches", "jacobians")
@@ -114,9 +117,9 @@ def listed_points(tables: Tables, state: State, capacity: int) -> dict[str, Arra
     inputs = {**tables.rows, **given(state, None, state.position.dtype)}
     shapes = {name: Shape(*x.shape) for name, x in inputs.items()}
     outputs = {"listing.points": Shape(points, sum(_POINT.values())), "listing.overflow": Shape(1, 1)}
-    room, numbers = room_of(tables, shapes, n, points), {"scene.n_blocks": tables.structure.n_blocks}
+    room, numbers = room_of(tables, shapes, n, points), tables.numbers
     module = "dano.engine.kernels.listing"
-    chosen = plan(module, "listing", tables.features, shapes, outputs, tables.whole.arrays, room, numbers)
+    chosen = plan(module, "listing", tables.features, shapes, outputs, tables.whole, room, numbers)
     found = launch(chosen, inputs)
     ends = np.cumsum(list(_POINT.values()))[:-1]
     parts = jnp.split(found["listing.points"], ends, axis=1)
@@ -140,7 +143,7 @@ def _plan(
     # Kernels on a CPU compute with 64 bits whatever goes in and comes out.
     rounding = OfWidth(*(float(np.finfo(x).eps) for x in (np.float64, np.float32)))
     numbers = {
-        "scene.n_blocks": tables.structure.n_blocks,
+        **tables.numbers,
         "launch.n_steps": n_steps,
         "launch.options.tolerance": relative,
         "launch.options.rounding": rounding,
@@ -155,28 +158,38 @@ def _plan(
     if len(tables.structure.loops):
         outputs["launch.forces"] = Shape(n_steps * len(tables.structure.loops), WRENCH)
     room = room_of(tables, shapes, n, CHUNK * capacity)
-    return plan(_MODULE, "rollout", tables.features, shapes, outputs, tables.whole.arrays, room, numbers)
+    return plan(_MODULE, "rollout", tables.features, shapes, outputs, tables.whole, room, numbers)
 
 
 def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> dict[str, int]:
     """Lengths of the arrays that a world works in."""
-    m, pairs = len(tables.structure.moving), len(tables.whole.arrays["scene.pair_index"])
+    m, whole = len(tables.structure.moving), tables.whole.arrays
+    n_patches = len(whole.get("scene.patches.contacts", ()))
+    # A pair that is listed has points; while one is looked at, it stands behind these.
+    found = min(len(whole["scene.pair_index"]), points + _MORE_FOUND + n_patches)
     blocks = tables.structure.n_blocks
-    most = int(max(tables.whole.arrays["scene.body_index"][:, 2], default=0))
+    most = int(max(whole["scene.body_index"][:, 2], default=0))
     lengths = {
-        "bodies": n,
-        **dict.fromkeys(("momentum", "inertia"), m),
+        **dict.fromkeys(("bodies", "partners", "sizes"), n),
+        **dict.fromkeys(("momentum", "inertia", "meetings"), m),
         **dict.fromkeys(("velocity", "old", "tried", "best", "moved", "step", "residual", "scale"), blocks),
-        **dict.fromkeys(("order", "counts", "degrees", "islands", "ends"), blocks),
-        **dict.fromkeys(("blocks", "spare", "used", "later", "listed"), blocks * blocks),
+        **dict.fromkeys(("order", "counts", "degrees", "neighbours", "islands", "members", "parts"), blocks),
+        **dict.fromkeys(("begins", "ends", "rests", "asleep"), blocks),
+        **dict.fromkeys(("used", "later", "beside", "listed"), blocks * blocks),
+        **dict.fromkeys(("blocks", "spare"), blocks * blocks + 1),
+        "lasting": 1,
         **dict.fromkeys(("where", "points", "laws", "gates", "marks", "duals", "changes", "linear"), points),
-        "found": pairs,
+        **dict.fromkeys(("found", "sorted_pairs"), found),
         **dict.fromkeys(("near", "until"), most),
     }
+    if "scene.partners" in whole:
+        pairs = tables.numbers["scene.n_pressing"]
+        lengths |= {**dict.fromkeys(("bounds", "kept", "sorted"), n)}
+        lengths |= {"marked": -(-pairs // 32), "candidates": pairs}
     room = {f"room.{name}": length for name, length in lengths.items()}
-    if "scene.trees.nodes" in tables.whole.arrays:
+    if "scene.trees.nodes" in whole:
         room |= tree_lengths(tables.structure)
-    if "scene.patches.contacts" in tables.whole.arrays:
+    if "scene.patches.contacts" in whole:
         room |= {"room.patches.count": 1}
         room |= dict.fromkeys(_PATCHES, shapes["scene.patches.materials"].rows)
     return room

@@ -1,6 +1,7 @@
 """A scene as rows of numbers, as kernels read them (`dano.engine.kernels.tables`)."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,7 +12,8 @@ from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Materi
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
 from dano.engine.launching._builds import build_for
 from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchTables
-from dano.maths import AnyArray, library
+from dano.engine.launching._plans import Whole
+from dano.maths import AnyArray, is_traced, library
 from dano.native import (
     balls_around_runs,
     Features,
@@ -41,12 +43,8 @@ _STRUCTURES = "dano.engine.kernels.tables"
 _TURNING = {"fixed": 0, "axis": 1, "ball": 2}
 
 
-class Whole:
-    """Whole numbers of a scene by place in a kernel's parameters, on the host."""
-
-    def __init__(self, arrays: dict[str, Int[np.ndarray, "..."]]):
-        """See the class."""
-        self.arrays = arrays
+SWEPT = 48
+"""Pairs up to which each step asks all of them whether they are near; more are swept."""
 
 
 class Tables(eqx.Module):
@@ -65,6 +63,11 @@ class Tables(eqx.Module):
     structure: TreeStructure = eqx.field(static=True)
 
     @property
+    def numbers(self) -> dict[str, int]:
+        """Numbers of the scene by place in a kernel's parameters."""
+        return {"scene.n_blocks": self.structure.n_blocks, "scene.n_pressing": self.whole.n_pressing}
+
+    @property
     def moving(self) -> Int[np.ndarray, " m"]:
         """Bodies that move."""
         return self.whole.arrays["scene.moving"]
@@ -81,7 +84,7 @@ def knows(scene: Scene) -> bool:
 
 def _own_law(scene: Scene) -> str:
     """The file of functions of the scene's point contacts, empty if they have the usual ones."""
-    files = {law.functions or "" for law, _ in _point_laws(scene)}
+    files = {law.functions or "" for law, _ in _point_laws(scene, _NONE)}
     if len(files) > 1:
         shown = sorted(name or "the usual ones" for name in files)
         raise ValueError(f"functions must be the same for all contacts of a scene, got {', '.join(shown)}")
@@ -149,25 +152,26 @@ def scene_tables(scene: Scene) -> Tables:
         middle=extents[:, :3],
         radius=library(extents).minimum(extents[:, 3], _FAR),
     )
-    groups = _point_laws(scene)
-    pair_rows = _pairs(scene, bodies, groups, pairs, extents, features)
+    known = _known_of_pairs(scene, bodies, pairs, extents, features)
     arrays = {
         "scene.bodies": body_rows,
         **surfaces,
         "scene.solids.leaves": of_leaves.rows,
         "scene.solids.coefficients": of_leaves.coefficients,
         "scene.solids.bounds": of_leaves.bounds,
-        "scene.pairs": pair_rows,
-        "scene.materials": _materials(groups, scene, features, dtype),
+        "scene.pairs": known.pairs,
+        "scene.materials": known.materials,
         "scene.gravity": scene.gravity[None].astype(dtype),
         "scene.timestep": scene.timestep[None, None],
     }
     whole = {
         "scene.body_index": np.array(index, np.int32),
         "scene.moving": structure.moving,
-        "scene.pair_index": np.concatenate([pairs.astype(np.int32), patches.pair_index]),
+        "scene.pair_index": np.concatenate([known.index, patches.pair_index]),
         "scene.solids.kinds": of_leaves.kinds,
     }
+    if len(pairs) > SWEPT:
+        whole["scene.partners"] = _partners(pairs, len(bodies))
     if len(patches.pair_index):
         arrays, whole = {**arrays, **patches.rows}, {**whole, **patches.whole}
     if scene.joints:
@@ -184,11 +188,19 @@ def _extent(body: Body) -> Float[AnyArray, "6"]:
     return np.zeros(6) if body.extent is None else body.extent
 
 
-def _point_laws(scene: Scene) -> list[tuple[DistributedLaw, ContactParams]]:
-    """Point laws and complete parameters, of one contact or arrays over several."""
+def _point_laws(
+    scene: Scene, others: Int[np.ndarray, "k 2"] | None = None
+) -> list[tuple[DistributedLaw, ContactParams]]:
+    """Point laws and complete parameters, of one contact or arrays over several.
+
+    Args:
+        scene: The scene.
+        others: Those of `Scene.others` that are asked for; None for all.
+    """
     groups = [(c.law, c.params) for c in scene.contacts if isinstance(c.law, DistributedLaw)]
     if scene.others is not None:
-        groups.append((scene.others.law, scene.others.pair_params))
+        asked = scene.others.pairs.array if others is None else others
+        groups.append((scene.others.law, scene.others.params_of(asked)))
     return groups
 
 
@@ -281,26 +293,113 @@ def _patches(scene: Scene, n_pairs: int, n_leaves: int) -> PatchTables:
     return patch_tables(pairs, scene.timestep.dtype, n_pairs=n_pairs, n_leaves=n_leaves, twins=twins)
 
 
+# No pairs.
+_NONE = np.zeros((0, 2), int)
+
+
+class _KnownOfPairs(NamedTuple):
+    """What kernels know of pairs whose first body's samples press on the second's solid."""
+
+    index: Int[np.ndarray, "k 5"]  # See `dano.engine.kernels.tables.PairIndex`
+    pairs: Float[AnyArray, "kinds 7"]
+    materials: Float[AnyArray, "materials width"]
+
+
+def _known_of_pairs(
+    scene: Scene,
+    bodies: Sequence[Body],
+    pairs: Int[np.ndarray, "k 3"],
+    extents: Float[AnyArray, "n 6"],
+    features: Features,
+) -> _KnownOfPairs:
+    """What is known of pairs, one row for all pairs of bodies that are alike."""
+    dtype = extents.dtype
+    first, second, contact = pairs.T
+    kinds = _kinds_of_bodies(scene, bodies, extents)
+    material, rest = _kinds_of_contacts(scene, kinds)
+    groups = _point_laws(scene, rest)
+    # A contact has two rows where both bodies' samples press.
+    rows = np.bincount(contact, minlength=len(material))[contact]
+    material = material[contact]
+    n = len(kinds)
+    keys = ((kinds[first] * n + kinds[second]) * (material.max(initial=0) + 1) + material) * 2 + rows - 1
+    some, row = _first_of_each(keys)
+    index = np.stack([first, second, material, row, contact], axis=1).astype(np.int32)
+    found = _pairs(scene, bodies, groups, index[some], 1.0 / rows[some], extents, features)
+    return _KnownOfPairs(index, found, _materials(groups, scene, features, dtype))
+
+
+def _first_of_each(keys: Int[np.ndarray, " k"]) -> tuple[Int[np.ndarray, " kinds"], Int[np.ndarray, " k"]]:
+    """Where each different key stands first, in this order, and for each key its place among them."""
+    _, first, place = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), int)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[place]
+
+
+def _kinds_of_bodies(
+    scene: Scene, bodies: Sequence[Body], extents: Float[AnyArray, "n 6"]
+) -> Int[np.ndarray, " n"]:
+    """A number for each body, the same for those of which contact knows the same.
+
+    Where numbers are traced, derivatives by those of each body may be asked for: then none are alike.
+    """
+    n = len(bodies)
+    others = scene.others
+    columns = [] if others is None else jax.tree.leaves((others.params, others.of_edges))
+    if is_traced(extents, columns) or n == 0:
+        return np.arange(n)
+    told = [np.array([body.surface is not None and body.surface.turning != "fixed" for body in bodies])]
+    if others is not None:
+        told += [np.array(x) for x in (others.flat, others.shapes, others.fixed)]
+    numbers = [np.asarray(x, float).reshape(n, -1) for x in (extents, *columns, *told)]
+    return np.unique(np.concatenate(numbers, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _kinds_of_contacts(
+    scene: Scene, kinds: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " contacts"], Int[np.ndarray, "rest 2"]]:
+    """Of each contact with a point law the row of its material, and which of `Scene.others` these rows need.
+
+    Each contact that is named has a row of its own.
+    """
+    named = sum(isinstance(contact.law, DistributedLaw) for contact in scene.contacts)
+    if scene.others is None:
+        return np.arange(named), _NONE
+    rest = scene.others.pairs.array
+    # Parameters of a pair do not depend on which of its bodies comes first.
+    low, high = np.sort(kinds[rest], axis=1).T
+    some, row = _first_of_each(low * len(kinds) + high)
+    return np.concatenate([np.arange(named), named + row]), rest[some]
+
+
+def _partners(pairs: Int[np.ndarray, "k 3"], n: int) -> Int[np.ndarray, " nn"]:
+    """See `dano.engine.kernels.tables.Scene.partners`."""
+    found = np.full(n * n, -1, np.int32)
+    found[pairs[:, 0] * n + pairs[:, 1]] = np.arange(len(pairs))
+    return found
+
+
 def _pairs(
     scene: Scene,
     bodies: Sequence[Body],
     groups: Sequence[tuple[DistributedLaw, ContactParams]],
-    pairs: Int[np.ndarray, "k 3"],
+    index: Int[np.ndarray, "k 5"],
+    share: Float[np.ndarray, " k"],
     extents: Float[AnyArray, "n 6"],
     features: Features,
 ) -> Float[AnyArray, "k 7"]:
-    """Rows of the pairs whose first body's samples press on the second's solid."""
+    """Rows of pairs whose first body's samples press on the second's solid, which have shares of contacts."""
     dtype, h = extents.dtype, scene.timestep
-    if not len(pairs):
+    if not len(index):
         return np.zeros((0, 7), dtype)
-    first, second, contact = pairs.T
-    # A contact has two rows where both bodies' samples press.
-    share = 1.0 / np.bincount(contact)[contact]
+    first, second, material = index.T[:3]
     smooth = np.array([body.surface is not None and body.surface.turning != "fixed" for body in bodies])
     xp = library(extents, h, scene.gravity, *jax.tree.leaves(groups))
     size, thickness = xp.minimum(extents[first, 4:], extents[second, 4:]).T
     gravity_step = _strength(scene) * h * h
-    depths = _impact_depths(groups, dtype)[contact]
+    depths = _impact_depths(groups, dtype)[material]
     return packed(
         features,
         "SamplePair",

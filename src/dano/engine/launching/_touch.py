@@ -62,6 +62,6 @@ def _seen(
     if kernel == "press":
         room["room.wrenches"] = room["room.found"]
     outputs = {name: Shape(pairs, width), **found}
-    numbers = {"scene.n_blocks": tables.structure.n_blocks}
-    chosen = plan(_MODULE, kernel, tables.features, shapes, outputs, tables.whole.arrays, room, numbers)
+    whole, numbers = tables.whole, tables.numbers
+    chosen = plan(_MODULE, kernel, tables.features, shapes, outputs, whole, room, numbers)
     return launch(chosen, inputs)[name]

@@ -34,7 +34,7 @@ from dano.engine.kernels.near import (
     second_until,
     solid_of_body,
 )
-from dano.engine.kernels.tables import FoundPair, Room, Scene
+from dano.engine.kernels.tables import FoundPair, numbers_of, Room, Scene
 from dano.physics.features import KINDS, LANES, TREES, UNIONS
 from dano.physics.friction import Slip
 from dano.physics.impacts import fall_of
@@ -226,7 +226,7 @@ def pull_pose(
     """
     index = scene.pair_index[found.pair]
     turning = scene.body_index[index.first].turning
-    bar, _a, _b, _c = wp.grad(pose_work)(at, turning, scene.pairs[world, found.pair].follows, by.pose)
+    bar, _a, _b, _c = wp.grad(pose_work)(at, turning, numbers_of(scene, world, found.pair).follows, by.pose)
     bar.share += by.share
     bar.timestep += by.timestep
     depth_bar = real(0.0)
@@ -293,7 +293,7 @@ def pull_support(
     The others are those by what supports them, by `left_out` and by the depth at which they meet.
     """
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
+    pair = numbers_of(scene, world, found.pair)
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
     a = falling(room.bodies[world, index.first], found.first_falls)
@@ -321,8 +321,8 @@ def pull_support(
         add_to_met(whole, falls)
         whole.scale += bar.scale
         whole.timestep += bar.timestep
-        room.bars.pairs[world, found.pair].factor += by_factor
-        room.bars.pairs[world, found.pair].impact_depth += by_depth + of_depth
+        room.bars.pairs[world, index.row].factor += by_factor
+        room.bars.pairs[world, index.row].impact_depth += by_depth + of_depth
         add_to_material(room.bars.materials, world, index.contact, by_material)
         add_to_material(room.bars.materials, world, index.contact, by.material)
     return whole
@@ -347,7 +347,7 @@ def pull_pair(
     angular momentum of its bodies is balanced.
     """
     index = scene.pair_index[found.pair]
-    pair = scene.pairs[world, found.pair]
+    pair = numbers_of(scene, world, found.pair)
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
     a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
@@ -412,15 +412,15 @@ def pull_pair(
         of_pose, depth_bar = pull_pose(scene, room, world, lane, found, at, samples.pose, by)
         add_to_met(bar, of_pose)
         add_to_material(room.bars.materials, world, index.contact, by.material)
-        room.bars.pairs[world, found.pair].share += by.stiffness_share
-        room.bars.pairs[world, found.pair].impact_depth += by.depth + by.impact.depth
-        room.bars.pairs[world, found.pair].factor += factor_bar
-        room.bars.pairs[world, found.pair].deepest += by.impact.deepest
+        room.bars.pairs[world, index.row].share += by.stiffness_share
+        room.bars.pairs[world, index.row].impact_depth += by.depth + by.impact.depth
+        room.bars.pairs[world, index.row].factor += factor_bar
+        room.bars.pairs[world, index.row].deepest += by.impact.deepest
         rests = found.hits > 0 and wp.length_sq(found.support) > ZERO
         if not rests and (found.hits > 0 or pair.impact_depth > pair.sink):
-            room.bars.pairs[world, found.pair].impact_depth += depth_bar
+            room.bars.pairs[world, index.row].impact_depth += depth_bar
         elif not rests:
-            room.bars.pairs[world, found.pair].sink += depth_bar
+            room.bars.pairs[world, index.row].sink += depth_bar
         if not rests:
             depth_bar = ZERO
     else:

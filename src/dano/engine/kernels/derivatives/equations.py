@@ -252,9 +252,7 @@ def is_moved_pair(twists: Virtual) -> bool:
 
 
 @wp.func
-def balance_bars(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, entry: int
-) -> tuple[real, real]:
+def balance_bars(scene: wp.ref[Scene], room: wp.ref[Room], world: int, entry: int) -> tuple[real, real]:
     """A pair's part of derivatives by when the angular momenta of its bodies are balanced."""
     met = real(0.0)
     lead = real(0.0)
@@ -266,7 +264,7 @@ def balance_bars(
                 side == 0, scene.pair_index[found.pair].first, scene.pair_index[found.pair].second
             )
             if wp.where(side == 0, found.first_waits, found.second_waits) > 0:
-                count, _waits, _shares = meetings_of(scene, room, world, n_found, body)
+                count = meetings_of(scene, room, world, body)[0]
                 met += room.body_bars[world, body].met / count
                 lead += room.body_bars[world, body].lead / count
             side += 1
@@ -295,7 +293,7 @@ def pull_equations(
     for f in range(n_found):
         entry = f * _LANES + lane
         twists = twists_of_pair(scene, room, world, entry)
-        met, lead = balance_bars(scene, room, world, n_found, entry)
+        met, lead = balance_bars(scene, room, world, entry)
         if is_moved_pair(twists) or met != ZERO or lead != ZERO:
             found = room.found[world, entry]
             rebound = launch.reports[world, t].rebound

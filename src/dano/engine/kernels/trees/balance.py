@@ -26,6 +26,7 @@ from dano.engine.kernels.trees.kinematics import (
     start_motions,
     unknown_of,
 )
+from dano.engine.kernels.trees.pattern import block_at
 from dano.engine.kernels.trees.tables import Node
 from dano.physics.momentum import angular_momentum
 from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
@@ -365,7 +366,7 @@ def eliminate_joint_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, 
             stiff = h * state.resolved.slope
             room.trees.joints[world, c].factored = state.resolved.slope
             if room.trees.coupled[world, scene.trees.blocks[b].tree] > 0:
-                room.spare[world, b * m + b][u % 6, u % 6] += stiff
+                room.spare[world, block_at(room, world, m, b, b)][u % 6, u % 6] += stiff
             elif not keeps:
                 room.trees.diagonal[world, u] = room.trees.diagonal[world, u] + stiff
 

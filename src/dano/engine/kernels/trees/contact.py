@@ -5,6 +5,7 @@ import warp as wp
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.factor import add_to_block
 from dano.engine.kernels.trees.kinematics import chain_twist
+from dano.engine.kernels.trees.pattern import block_at
 from dano.physics.real import mat66, real, vec3, vec6
 from dano.physics.trees.joints import ROOT
 from dano.physics.twists import shift
@@ -70,7 +71,7 @@ def add_slopes(scene: wp.ref[Scene], room: wp.ref[Room], world: int, row: int, o
     a = scene.trees.nodes[row]
     b = scene.trees.nodes[other]
     if a.kind == _ROOT and b.kind == _ROOT:
-        room.blocks[world, (a.place // 6) * m + b.place // 6] += slopes
+        room.blocks[world, block_at(room, world, m, a.place // 6, b.place // 6)] += slopes
     elif a.kind == _ROOT:
         for k in range(b.first_column, b.first_column + b.columns):
             pushed = slopes * room.trees.columns[world, k]

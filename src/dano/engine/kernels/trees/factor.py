@@ -10,6 +10,7 @@ import warp as wp
 
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.kinematics import unknown_of
+from dano.engine.kernels.trees.pattern import block_at
 from dano.engine.kernels.trees.tables import Node
 from dano.physics.real import mat66, ONE, real, vec6, ZERO
 
@@ -191,7 +192,8 @@ def mobility(scene: wp.ref[Scene], room: wp.ref[Room], world: int, node: Node) -
 @wp.func
 def add_to_block(room: wp.ref[Room], world: int, m: int, row: int, column: int, value: real):
     """Add to an entry of the Jacobian by blocks."""
-    room.blocks[world, (row // 6) * m + column // 6][row % 6, column % 6] += value
+    at = block_at(room, world, m, row // 6, column // 6)
+    room.blocks[world, at][row % 6, column % 6] += value
 
 
 @wp.func
@@ -212,9 +214,10 @@ def spread_over_blocks(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
                 t -= 1
     for b in range(m):
         index = scene.trees.blocks[b]
-        if room.used[world, b * m + b] > 0:
+        at = room.used[world, b * m + b] - 1
+        if at >= 0:
             for c in range(index.used, 6):
-                room.blocks[world, b * m + b][c, c] = ONE
+                room.blocks[world, at][c, c] = ONE
 
 
 @wp.func

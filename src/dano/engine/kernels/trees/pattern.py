@@ -11,8 +11,21 @@ _ROOT = wp.constant(ROOT)
 @wp.func
 def couple(room: wp.ref[Room], world: int, m: int, i: int, j: int):
     """Say that two blocks are coupled."""
-    room.used[world, i * m + j] = 1
-    room.used[world, j * m + i] = 1
+    if room.used[world, i * m + j] == 0:
+        room.used[world, i * m + j] = 1
+        if i != j:
+            room.used[world, j * m + i] = 1
+            room.beside[world, i * m + room.neighbours[world, i]] = j
+            room.beside[world, j * m + room.neighbours[world, j]] = i
+            room.neighbours[world, i] = room.neighbours[world, i] + 1
+            room.neighbours[world, j] = room.neighbours[world, j] + 1
+
+
+@wp.func
+def block_at(room: wp.ref[Room], world: int, m: int, row: int, column: int) -> int:
+    """Where the block of a row and a column stands; beyond all that is read if it is not in use."""
+    place = room.used[world, row * m + column]
+    return wp.where(place > 0, place - 1, m * m)
 
 
 @wp.func
