@@ -373,7 +373,7 @@ class Room:
         missing: Changes of the equations of a step, shape (worlds, directions · m).
         moving: Changes of what the step is given, one direction after the other.
         along: What they make of a number, by directions.
-        parts: … by changes of samples and coefficients, the part of each lane, (worlds, directions · lanes).
+        lane_sums: … by changes of samples and coefficients, of each lane, shape (worlds, directions · lanes).
     """
 
     bodies: wp.array2d(dtype=BodyState)
@@ -439,7 +439,7 @@ class Room:
         missing: wp.array2d(dtype=vec6)
         along: wp.array2d(dtype=real)
         moving: wp.array2d(dtype=real)
-        parts: wp.array2d(dtype=real)
+        lane_sums: wp.array2d(dtype=real)
 
 
 @wp.struct

@@ -24,7 +24,7 @@ LANES = 32
 PLATFORM = "CUDA"
 # Arrays in the room that have a part for each lane, of the length that one lane needs; and lists of points,
 # of which each lane has a part that is that much longer than its share: lanes do not find equally many.
-_OF_EACH_LANE = ("room.found", "room.parts")
+_OF_EACH_LANE = ("room.found", "room.lane_sums")
 _OF_POINTS = tuple(
     f"room.{name}"
     for name in ("near", "until", "where", "points", "laws", "gates", "marks", "duals", "changes", "linear")

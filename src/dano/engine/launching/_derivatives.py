@@ -371,7 +371,7 @@ def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) 
     inputs |= {"ends.controls": Shape(steps * _length(numbers, _CONTROLS), 1)}
     inputs |= {_MANY[name][1]: Shape(n_directions * x.rows, x.width) for name, x in many.items()}
     room = {_MANY[name][0]: x.rows for name, x in many.items() if name != _COEFFICIENTS}
-    room |= {"room.parts": n_directions, "room.along": n_directions, "room.moving": n_directions * row}
+    room |= {"room.lane_sums": n_directions, "room.along": n_directions, "room.moving": n_directions * row}
     room["room.missing"] = n_directions * forward.room["room.velocity"]
     return plan(
         "dano.engine.kernels.derivatives.pushforward",

@@ -73,7 +73,9 @@ def leaf_at(scene: wp.ref[Scene], world: int, body: int, x: vec3) -> Solid:
 @wp.func
 def add_part(room: wp.ref[Room], world: int, lane: int, direction: int, change: real):
     """Add to a lane's part of what changes in a direction make of a number."""
-    room.parts[world, direction * _LANES + lane] = room.parts[world, direction * _LANES + lane] + change
+    room.lane_sums[world, direction * _LANES + lane] = (
+        room.lane_sums[world, direction * _LANES + lane] + change
+    )
 
 
 @wp.func
@@ -81,7 +83,7 @@ def n_moving(scene: wp.ref[Scene], room: wp.ref[Room]) -> int:
     """In how many directions coefficients of sampled solids change."""
     if scene.solids.changes.shape[1] == 0:
         return 0
-    return room.parts.shape[1] // _LANES
+    return room.lane_sums.shape[1] // _LANES
 
 
 @wp.func

@@ -48,8 +48,8 @@ def clear_bars(scene: wp.ref[Scene], room: wp.ref[Room], ends: wp.ref[Ends], wor
     """Ask for nothing: derivatives but these are used up, see `change_along`."""
     for i in range(lane, ends.after.shape[1], _LANES):
         ends.after[world, i] = ZERO
-    for i in range(lane, room.parts.shape[1], _LANES):
-        room.parts[world, i] = ZERO
+    for i in range(lane, room.lane_sums.shape[1], _LANES):
+        room.lane_sums[world, i] = ZERO
     if lane == 0:
         for b in range(scene.n_blocks):
             room.step[world, b] = vec6()
@@ -115,7 +115,7 @@ def change_along(
             for f in range(n_found, n_found + n_patches(room, world)):
                 use_weighted(scene, room, ends, world, lane, room.found[world, f * _LANES + lane])
     for d in range(launch.n_directions):
-        change = total(room.parts[world, d * _LANES + lane])
+        change = total(room.lane_sums[world, d * _LANES + lane])
         if lane == 0:
             room.along[world, d] = change
     wait()
