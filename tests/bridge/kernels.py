@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from dano.mujoco._search import filled, Known, part_of_geom
-from dano.mujoco._solids import geom_of
+from dano.mujoco._things import geom_of
 from dano.native import Features, instance
 
 FEATURES = Features(KINDS=frozenset(range(7)), DEGREES=frozenset({2}), UNIONS=False)

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from dano.fields.meshes import _winding
-from dano.fields.meshes._winding import mark_nodes, winding_numbers
+from dano.fields.meshes import _field
+from dano.fields.meshes._field import mark_nodes, winding_numbers
 
 igl = pytest.importorskip("igl")
 trimesh = pytest.importorskip("trimesh")
@@ -57,7 +57,7 @@ def test_are_sums_of_solid_angles(name, monkeypatch):
         np.testing.assert_allclose(wanted[clear], np.rint(wanted[clear]), atol=1e-6)
         found = winding_numbers(vertices, faces, points)
         np.testing.assert_array_equal(found[clear], np.rint(wanted[clear]))
-        monkeypatch.setattr(_winding, "_AT_ONCE", 50)
+        monkeypatch.setattr(_field, "_AT_ONCE", 50)
         np.testing.assert_array_equal(winding_numbers(vertices, faces, points), found)
         monkeypatch.undo()
 

@@ -15,11 +15,17 @@ from vision.photographs import capture, CENTRE, SEMI_AXES
 import dano
 from dano.report import view, view_capture, view_field, write_capture_view, write_field_view, write_view
 from dano.report.viewing._capture import _camera_length
-from dano.report.viewing._drawn import Drawn, Shown
+from dano.report.viewing._drawn import (
+    add_coloured,
+    body_mesh,
+    BodyMesh,
+    Drawn,
+    shape_mesh,
+    Shown,
+    surface_mesh,
+)
 from dano.report.viewing._field import Surface
-from dano.report.viewing._meshes import add_coloured, body_mesh, BodyMesh, shape_mesh, surface_mesh
-from dano.report.viewing._opening import open_on
-from dano.report.viewing._serving import serve
+from dano.report.viewing._serving import open_on, serve
 from dano.scene_file import asset_look, load_asset
 from dano.vision import Camera, Capture, LearnedField, visual_hull
 

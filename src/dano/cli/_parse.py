@@ -64,9 +64,9 @@ GROUPS: dict[str, dict[str, _Row]] = {
     "From fields, and to other programs": {
         "build": _Row(Build, "_objects:build", "dano build my_nerf.npz --length 0.12 --mass 0.35"),
         "import": _Row(
-            Import, "_import:import_field", "dano import step-000029999.ckpt --crop -1 -1 -1 1 1 1"
+            Import, "_objects:import_field", "dano import step-000029999.ckpt --crop -1 -1 -1 1 1 1"
         ),
-        "export": _Row(Export, "_export:export", "dano export mug.dano --to mjcf urdf"),
+        "export": _Row(Export, "_objects:export", "dano export mug.dano --to mjcf urdf"),
         "compare": _Row(Compare, "_compare:compare", "dano compare mug.dano"),
     },
     "With scenes": {

@@ -9,12 +9,27 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.checks import checked_count, checked_items, checked_kind, checked_optional
-from dano.comparison._bodies import GRAVITY, Path, Probes, Rigid, rotation_of, Solid, Start, together
+from dano.comparison._bodies import (
+    best_level,
+    GRAVITY,
+    Grid,
+    hull_of,
+    level_mesh,
+    Mesh,
+    nearest_rest,
+    Path,
+    pieces_of,
+    Probes,
+    Rigid,
+    rotation_of,
+    Solid,
+    stable_directions,
+    Start,
+    together,
+)
 from dano.comparison._mujoco import MuJoCo
 from dano.comparison._own import Own
 from dano.comparison._pybullet import has_pybullet, PyBullet
-from dano.comparison._rest import nearest_rest, stable_directions
-from dano.comparison._routes import best_level, Grid, hull_of, level_mesh, Mesh, pieces_of
 from dano.exchange import convex_hull, enclosed, Moments, signed_distances, solid_triangles, Triangles
 from dano.extras import is_installed
 from dano.fields import AbstractField, AbstractShape, bake, GridField

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from dano.checks import checked_kind
+from dano.compiling import one_program
 from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._grid import GridField
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._signed_distance import SignedDistanceGrid
-from dano.hosted import hosted
 from dano.maths import checked_array, einsum, Pose, product
 
 
@@ -144,7 +144,7 @@ class PosedField(AbstractField):
     pose: Pose
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Axis-aligned box [m] around the moved bounds of the inner field."""
         return posed_bounds(self.field.bounds, self.pose)
@@ -184,13 +184,13 @@ class PosedShape(AbstractShape):
         return self.shape.edge
 
     @property
-    @hosted
+    @one_program
     def size(self) -> Float[Array, ""]:
         """Size of the inner shape [m], so that turning a shape does not change its smooth edge."""
         return self.shape.size
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Axis-aligned box [m] around the moved bounds of the inner shape."""
         return posed_bounds(self.shape.bounds, self.pose)
@@ -207,7 +207,7 @@ class PosedShape(AbstractShape):
         """See `AbstractShape.sdf_jet`."""
         return _posed_jet(self.shape.sdf_jet, self.pose, x, order)
 
-    @hosted
+    @one_program
     def solid_moments(self) -> SolidMoments | None:
         """Moments of the inner shape, moved: V, R c + p, R S Rᵀ."""
         moments = self.shape.solid_moments()
@@ -242,7 +242,7 @@ class ScaledField(AbstractField):
     factor: Float[Array, ""]
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Scaled bounds [m] of the inner field."""
         return self.field.bounds * self.factor.astype(self.field.bounds.dtype)
@@ -283,13 +283,13 @@ class ScaledShape(AbstractShape):
         return None if edge is None else edge * self.factor.astype(edge.dtype)
 
     @property
-    @hosted
+    @one_program
     def size(self) -> Float[Array, ""]:
         """Scaled size of the inner shape [m]."""
         return self.shape.size * self.factor.astype(self.shape.size.dtype)
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Scaled bounds [m] of the inner shape."""
         return self.shape.bounds * self.factor.astype(self.shape.bounds.dtype)
@@ -308,7 +308,7 @@ class ScaledShape(AbstractShape):
         factor = self.factor.astype(x.dtype)
         return jax.tree.map(lambda part: factor * part, _scaled_jet(self.shape.sdf_jet, factor, x, order))
 
-    @hosted
+    @one_program
     def solid_moments(self) -> SolidMoments | None:
         """Moments of the inner shape: V s³, c s, S s⁵."""
         moments = self.shape.solid_moments()
@@ -330,7 +330,7 @@ class UnionField(AbstractField):
     fields: tuple[AbstractField, ...]
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Box [m] around the bounds of all parts."""
         return _joined_bounds(self.fields)
@@ -371,7 +371,7 @@ class UnionShape(AbstractShape):
     edge: Float[Array, ""] | None
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Box [m] around the bounds of all parts."""
         return _joined_bounds(self.shapes)

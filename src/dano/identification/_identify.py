@@ -24,11 +24,10 @@ from dano.identification._parameters import (
 )
 from dano.identification._problem import Problem
 from dano.identification._residuals import Linearized, shifted, Smoothing
-from dano.identification._result import Errors, Identification, Minimum
 from dano.identification._scales import check_scales
 from dano.identification._settings import deviations, estimated, IdentifyOptions, Setup
 from dano.identification._settling import ripple_covariance, worth_of
-from dano.identification._uncertainty import scattered, uncertainty
+from dano.identification._uncertainty import Errors, Identification, Minimum, scattered, uncertainty
 from dano.identification._windows import Plan
 from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply

@@ -7,9 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dano.mujoco._settings import is_gap_beyond, Settings
-from dano.mujoco._solids import Geom, object_solid, Solid
-from dano.mujoco._surfaces import Surface
-from dano.mujoco._things import Thing
+from dano.mujoco._things import Geom, object_solid, Solid, Surface, Thing
 from dano.mujoco.kernels import words
 from dano.mujoco.kernels.words import REALS, WHOLES
 from dano.native import (

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Int
 from dano.mujoco._model import standin_name
 from dano.mujoco._search import Known, Part, part_of_geom, part_of_thing, Search
 from dano.mujoco._settings import overriding, Settings
-from dano.mujoco._solids import geom_of
-from dano.mujoco._things import Thing
+from dano.mujoco._things import geom_of, Thing
 from dano.mujoco._worlds import Worlds
 
 MOST = 8

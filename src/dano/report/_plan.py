@@ -9,8 +9,7 @@ from dano.archive import checked_output, replacing
 from dano.checks import checked_kind
 from dano.planning import Plan, Task
 from dano.progress import Progress
-from dano.report._resample import frame_times
-from dano.report._stage import Stage, stage
+from dano.report._stage import frame_times, Stage, stage
 from dano.report._video import check_film, checked_video, film, require, take_of, VideoOptions
 from dano.scene import Scene
 from dano.vision import Item, LearnedField

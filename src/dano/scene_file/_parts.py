@@ -19,7 +19,7 @@ from dano.checks import checked_items, checked_kind, checked_number, checked_pat
 from dano.fields import AbstractShape, load_field, scaled, SignedDistanceGrid
 from dano.keys import seed_key
 from dano.objects import MassProperties, NeuralObject
-from dano.scene_file._doubts import size_doubts
+from dano.scene_file._forecast import size_doubts
 from dano.scene_file._objects import Progress
 
 _OVERLAPS = 0.1

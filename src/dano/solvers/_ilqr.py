@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.solvers._box import box_minimum
+from dano.solvers._least_squares import box_minimum
 from dano.solvers._trajectory import (
     constraint_values,
     held,

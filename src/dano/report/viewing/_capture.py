@@ -11,10 +11,8 @@ from jaxtyping import Float, UInt8
 from dano.checks import checked_kind, checked_text
 from dano.exchange import level_triangles
 from dano.maths import quat_from_matrix
-from dano.report._capture import SPLIT_COLOURS
-from dano.report.viewing._ground import add_ground, add_note
-from dano.report.viewing._opening import open_on
-from dano.report.viewing._serving import serve, Viewer, write_file
+from dano.report._training import SPLIT_COLOURS
+from dano.report.viewing._serving import add_ground, add_note, open_on, serve, Viewer, write_file
 from dano.vision import Capture, checked_colour, View, visual_hull
 
 _THUMBNAIL = 96

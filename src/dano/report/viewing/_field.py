@@ -13,11 +13,9 @@ from dano.checks import checked_kind, checked_number
 from dano.exchange import enclosed, level_triangles, signed_distances, Triangles
 from dano.fields import AbstractField, AbstractShape, bake, GridField, SignedDistanceGrid
 from dano.objects import node_values
-from dano.report._overlay import round_below
-from dano.report.viewing._ground import add_ground, add_note
-from dano.report.viewing._meshes import add_coloured, BodyMesh, shape_mesh, vertex_colours
-from dano.report.viewing._opening import open_on
-from dano.report.viewing._serving import serve, Viewer, write_file
+from dano.report._stage import round_below
+from dano.report.viewing._drawn import add_coloured, BodyMesh, shape_mesh, vertex_colours
+from dano.report.viewing._serving import add_ground, add_note, open_on, serve, Viewer, write_file
 from dano.vision import checked_colour, LearnedField, PALETTE, usual_level
 
 _NODES = 96

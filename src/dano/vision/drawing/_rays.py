@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
+from dano.compiling import one_program
 from dano.fields import AbstractShape, GridField
-from dano.hosted import hosted
 from dano.maths import product
 from dano.native import (
     cpu_kernel,
@@ -248,7 +248,7 @@ def _made(shapes: Sequence[AbstractShape]) -> _Tables:
     return _Tables(parts, {name: np.ascontiguousarray(x) for name, x in named.items()})
 
 
-@hosted
+@one_program
 def _leaf_tables(leaves: list[Placed]) -> Leaves:
     return leaf_tables(leaves, jnp.float32)
 
