@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dano import exchange
-from dano.maths import quat_to_matrix
+from dano.maths import quat_to_matrix, rigidly_joined
 
 _TIPPED = math.radians(4.0)
 """A pose counts as stable if tipping it by this much raises the centre of mass, whichever way."""
@@ -301,14 +301,7 @@ class Probes(NamedTuple):
 def together(pieces: list[exchange.Triangles]) -> exchange.Moments:
     """Volume, centroid and inertia of pieces that do not overlap."""
     parts = [exchange.enclosed(piece) for piece in pieces]
-    volumes = np.array([part.volume for part in parts])
-    volume = float(volumes.sum())
-    com = volumes @ np.array([part.com for part in parts]) / volume
-    inertia = np.zeros((3, 3))
-    for part in parts:
-        away = part.com - com
-        inertia += part.inertia + part.volume * (away @ away * np.eye(3) - np.outer(away, away))
-    return exchange.Moments(volume, com, inertia)
+    return exchange.Moments(*rigidly_joined(*(np.array([part[k] for part in parts]) for k in range(3))))
 
 
 def rotation_of(start: Start) -> Float[np.ndarray, "3 3"]:

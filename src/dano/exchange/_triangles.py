@@ -14,7 +14,14 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from dano.contact import ContactParams
 from dano.extras import is_installed, optional
-from dano.fields import AbstractShape, convex_hull as hull_of, convex_pieces, load_coacd, Splats
+from dano.fields import (
+    AbstractShape,
+    convex_hull as hull_of,
+    convex_pieces,
+    largest_part as connected,
+    load_coacd,
+    Splats,
+)
 
 if TYPE_CHECKING:
     from dano.vision import LearnedField
@@ -227,12 +234,7 @@ def largest_part(values: Float[np.ndarray, "nx ny nz"], level: float) -> Bool[np
     """Nodes of the largest connected part of {φ ≥ level}, with the cavities that it encloses."""
     from scipy import ndimage
 
-    labels, parts = ndimage.label(values >= level, np.ones((3, 3, 3)))
-    if parts == 0:
-        return np.zeros(values.shape, bool)
-    count = np.bincount(labels.ravel())
-    count[0] = 0
-    return ndimage.binary_fill_holes(labels == int(np.argmax(count)))
+    return ndimage.binary_fill_holes(connected(values >= level, corners=True))
 
 
 def _igl() -> Any:

@@ -5,7 +5,7 @@ from typing import overload
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from dano.checks import checked_kind
 from dano.compiling import one_program
@@ -320,6 +320,16 @@ def _joined_bounds(fields: tuple[AbstractField, ...]) -> Float[Array, "2 3"]:
     return jnp.stack([jnp.min(bounds[:, 0], axis=0), jnp.max(bounds[:, 1], axis=0)])
 
 
+def _of_part(index: Int[Array, " n"], jets: list[Jet]) -> Jet:
+    """At each point the jet of one of the parts."""
+
+    def chosen(*rows: Array) -> Array:
+        choice = jnp.broadcast_to(index, (1, *rows[0].shape))
+        return jnp.take_along_axis(jnp.stack(rows), choice, axis=0)[0]
+
+    return jax.tree.map(chosen, *jets)
+
+
 class UnionField(AbstractField):
     """The largest density of several fields; see `union`.
 
@@ -350,14 +360,7 @@ class UnionField(AbstractField):
         jets = [field.jet(x, order) for field in self.fields]
         if order == 0:
             return jnp.max(jnp.stack(jets), axis=0)
-        densest = jnp.argmax(jnp.stack([jet[0] for jet in jets]), axis=0)
-
-        def choose(*parts: Array) -> Array:
-            stacked = jnp.stack(parts)
-            index = jnp.broadcast_to(densest, (1, *stacked.shape[1:]))
-            return jnp.take_along_axis(stacked, index, axis=0)[0]
-
-        return jax.tree.map(choose, *jets)
+        return _of_part(jnp.argmax(jnp.stack([jet[0] for jet in jets]), axis=0), jets)
 
 
 class UnionShape(AbstractShape):
@@ -385,13 +388,7 @@ class UnionShape(AbstractShape):
         parts = [shape.sdf_jet(x, order) for shape in self.shapes]
         if order == 0:
             return jnp.min(jnp.stack(parts), axis=0)
-        nearest = jnp.argmin(jnp.stack([part[0] for part in parts]), axis=0)
-
-        def of_nearest(*rows: Array) -> Array:
-            choice = jnp.broadcast_to(nearest, (1, *rows[0].shape))
-            return jnp.take_along_axis(jnp.stack(rows), choice, axis=0)[0]
-
-        return jax.tree.map(of_nearest, *parts)
+        return _of_part(jnp.argmin(jnp.stack([part[0] for part in parts]), axis=0), parts)
 
     def solid_moments(self) -> None:
         """None: parts may overlap, so their moments do not add."""

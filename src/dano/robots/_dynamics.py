@@ -28,6 +28,7 @@ from dano.maths import (
     quat_log,
     quat_multiply,
     quat_rotate,
+    rigidly_joined,
 )
 from dano.robots.formats import at_home, Connection, Description, Link, Placed, rotation_of
 from dano.scene import Chains, Control, joints_of, place_links, pulls, Scene, State, triples
@@ -85,16 +86,15 @@ def combined_inertia(links: Sequence[tuple[Link, Placed]]) -> Inertial:
     """Mass [kg], centre [m] and inertia about it [kg m²] of links at places in a frame."""
     # What has no mass has no inertia, whatever the file says.
     links = [(link, place) for link, place in links if link.mass > 0]
-    mass = sum(link.mass for link, _ in links)
-    coms = [np.array(where.position) + rotation_of(where.orientation) @ link.com for link, where in links]
-    if mass <= 0:
+    if not links:
         return 0.0, np.zeros(3), np.zeros((3, 3))
-    com = sum((link.mass * c for (link, _), c in zip(links, coms, strict=True)), np.zeros(3)) / mass
-    inertia = np.zeros((3, 3))
-    for (link, where), own in zip(links, coms, strict=True):
-        turn, arm = rotation_of(where.orientation), own - com
-        inertia += turn @ link.inertia @ turn.T + link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return mass, com, inertia
+    turns = [rotation_of(place.orientation) for _, place in links]
+    coms = [
+        np.array(place.position) + turn @ link.com for (link, place), turn in zip(links, turns, strict=True)
+    ]
+    inertias = [turn @ link.inertia @ turn.T for (link, _), turn in zip(links, turns, strict=True)]
+    masses = np.array([link.mass for link, _ in links], np.float64)
+    return rigidly_joined(masses, np.array(coms), np.array(inertias))
 
 
 def excess(inertia: np.ndarray) -> float:

@@ -204,7 +204,7 @@ class Body(eqx.Module):
         vectors = scale.prod() / scale * np.asarray(self.surface.vectors)
         turned = self.surface.turning == "ball"
         # The densest samples of a ball lie at its −z, and turn to where it touches.
-        up = np.array([[0.0, 0.0, 1.0]]) if turned else _directions(ORIENTATIONS)
+        up = np.array([[0.0, 0.0, 1.0]]) if turned else maths.even_directions(ORIENTATIONS)
         heights = up @ points
         depths = np.maximum(depth - (heights - heights.min(axis=1, keepdims=True)), 0)
         facing = np.maximum(-up @ vectors, 0)
@@ -354,14 +354,6 @@ def _shared(
 ) -> Float[maths.Q, "3 3"]:
     """Inertia of a body with another mass than its own."""
     return inertia * (mass / own)
-
-
-def _directions(n: int) -> np.ndarray:
-    """Unit vectors spread evenly over the sphere (a Fibonacci lattice), shape (n, 3)."""
-    k = np.arange(n) + 0.5
-    z, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
 def _properties(
