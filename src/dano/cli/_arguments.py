@@ -88,7 +88,7 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Data:
+class CheckPhotographs:
     """Check photographs before training: poses, masks, coverage. Draw the cameras."""
 
     images: Positional[Path]  # Folder with transforms.json or anno_train.json, or one of these files
@@ -102,7 +102,7 @@ class Data:
 
 
 @dataclass(frozen=True)
-class Build:
+class BuildObject:
     """Make a neural object of a density field: mass, centre of mass, inertia, contact samples."""
 
     # Density grid (.npz with values, origin, spacing), voxels (.npy), mesh (.obj, .stl, …), object (.dano), a

@@ -9,7 +9,7 @@ import numpy as np
 
 from dano import vision
 from dano.archive import write_json
-from dano.cli._arguments import Data, Poses, Train
+from dano.cli._arguments import CheckPhotographs, Poses, Train
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
 from dano.cli.tracking.filming import focal_of
@@ -123,7 +123,7 @@ def _print_poses(found: vision.EstimatedPoses) -> None:
         say(f"warning: {text}")
 
 
-def data(command: Data) -> None:
+def data(command: CheckPhotographs) -> None:
     """See `dano data --help`."""
     png = command.png
     picture = None if command.no_png else png or Path(f"{command.images.resolve().stem}.png")

@@ -16,7 +16,7 @@ import numpy as np
 
 from dano import exchange, fields, objects, robots, scene_file
 from dano.building import BuildOptions
-from dano.cli._arguments import Build, Export, Import, Inspect
+from dano.cli._arguments import BuildObject, Export, Import, Inspect
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._outputs import check_output, missing_for_pictures
 from dano.contact import ContactParams
@@ -237,7 +237,7 @@ def _print(report: dict[str, Any]) -> None:
 _ROBOTS = (".urdf", ".xml", ".mjcf")
 
 
-def build(command: Build) -> None:
+def build(command: BuildObject) -> None:
     """See `dano build --help`."""
     output, options = command.output, command.options
     if options.mass is not None and options.mass_scale is not None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from dano.archive import checked_output
 from dano.cli._arguments import (
-    Build,
+    BuildObject,
     Compare,
     Export,
     Import,
@@ -22,7 +22,7 @@ from dano.extras import is_installed
 
 _NAMED_AFTER: dict[type, tuple[str, str]] = {
     Train: ("images", ".dano"),
-    Build: ("field", ".dano"),
+    BuildObject: ("field", ".dano"),
     Import: ("file", ".grid.npz"),
     Simulate: ("scene", "_run.npz"),
     Track: ("video", "_motion.npz"),

@@ -223,7 +223,7 @@ class Rigid(NamedTuple):
     surface: exchange.Triangles | None = None
 
 
-class Start(NamedTuple):
+class Drop(NamedTuple):
     """How a body is let go.
 
     Attributes:
@@ -304,6 +304,6 @@ def together(pieces: list[exchange.Triangles]) -> exchange.Moments:
     return exchange.Moments(*rigidly_joined(*(np.array([part[k] for part in parts]) for k in range(3))))
 
 
-def rotation_of(start: Start) -> Float[np.ndarray, "3 3"]:
+def rotation_of(start: Drop) -> Float[np.ndarray, "3 3"]:
     """F → W."""
     return quat_to_matrix(np.asarray(start.orientation, np.float64))

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from dano.checks import checked_count, checked_items, checked_kind, checked_optional
 from dano.comparison._bodies import (
     best_level,
+    Drop,
     GRAVITY,
     Grid,
     hull_of,
@@ -24,7 +25,6 @@ from dano.comparison._bodies import (
     rotation_of,
     Solid,
     stable_directions,
-    Start,
     together,
 )
 from dano.comparison._mujoco import MuJoCo
@@ -156,7 +156,7 @@ class _Bench(NamedTuple):
     thing: NeuralObject
     solid: Solid
     stable: Float[np.ndarray, "n 3"]
-    starts: list[Start]
+    starts: list[Drop]
     n_steps: int
     probes: Probes
     truth: NeuralObject | None
@@ -318,11 +318,11 @@ def _bench(thing: NeuralObject, truth: AbstractShape | None, drops: int, seed: i
     return _Bench(thing, solid, stable, starts, n_steps, probes, true, {})
 
 
-def _start(points: Float[np.ndarray, "n 3"], size: float, random: np.random.Generator) -> Start:
+def _start(points: Float[np.ndarray, "n 3"], size: float, random: np.random.Generator) -> Drop:
     """A random orientation, slowly turning, the lowest point a quarter of the size over the floor."""
     orientation = random.normal(size=4)
     orientation /= np.linalg.norm(orientation)
-    start = Start(np.zeros(3), orientation, 0.3 * math.sqrt(GRAVITY / size) * random.normal(size=3))
+    start = Drop(np.zeros(3), orientation, 0.3 * math.sqrt(GRAVITY / size) * random.normal(size=3))
     lowest = float((points @ rotation_of(start)[2]).min())
     return start._replace(origin=np.array([0.0, 0.0, _ABOVE * size - lowest]))
 

@@ -14,9 +14,17 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.engine import device_mesh
-from dano.identification._checkpoint import Checkpoint
+from dano.identification._checkpoint import SearchCheckpoint
 from dano.identification._planes import Smoothing
-from dano.identification._residuals import Linearized, linearized, losses, Model, moved, shifted, Start
+from dano.identification._residuals import (
+    Linearized,
+    linearized,
+    losses,
+    moved,
+    ResidualModel,
+    shifted,
+    WindowStart,
+)
 from dano.identification._settings import Setup, start_deviations
 from dano.identification._settling import settled
 from dano.identification._uncertainty import Groups, Identification
@@ -92,7 +100,7 @@ _BATCH = 1024
 class _Last(NamedTuple):
     """The last simulation, and what it was of."""
 
-    model: Model
+    model: ResidualModel
     smoothing: Smoothing | None
     x: Array
     states: tuple[State, State]
@@ -153,7 +161,7 @@ class Problem:
             # Velocities that were not observed may miss by what would move a window's end by the noise.
             span = max(1e-6, float(self.plan.n_steps * scene.timestep))
             self.jumps = jnp.asarray(self.start.widths(self._usual(span)), dtype)
-        self.model = Model(
+        self.model = ResidualModel(
             scene,
             policy,
             setup.engine,
@@ -345,7 +353,7 @@ class Problem:
         tolerance: float,
         tell,
         free: bool = True,
-        kept: Checkpoint | None = None,
+        kept: SearchCheckpoint | None = None,
     ) -> Solution:
         """Minimise from x; with `free` false over the initial states alone.
 
@@ -522,13 +530,13 @@ def _where(windows: np.ndarray, one: State, other: State) -> State:
     return jax.tree.map(lambda a, b: jnp.where(pick.reshape(-1, *[1] * (a.ndim - 1)), a, b), one, other)
 
 
-def _start_of(scene: Scene, bodies: Sequence[int], initial: tuple[str, ...]) -> Start:
+def _start_of(scene: Scene, bodies: Sequence[int], initial: tuple[str, ...]) -> WindowStart:
     """What is estimated of initial states when some bodies were observed."""
     layout = scene.layout
     kinds = [scene.joints[j].kind for j in layout.with_coordinates]
     on_joints = any(i in layout.children for i in bodies)
     free = tuple(i for i in bodies if i in layout.free)
-    return Start(free, tuple(kind == "hinge" for kind in kinds) if on_joints else (), initial)
+    return WindowStart(free, tuple(kind == "hinge" for kind in kinds) if on_joints else (), initial)
 
 
 def _for_each(name: str, given: Any, motions: Sequence[Motion]) -> list[Any]:

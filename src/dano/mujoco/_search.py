@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dano.mujoco._settings import is_gap_beyond, Settings
-from dano.mujoco._things import Geom, object_solid, Solid, Surface, Thing
+from dano.mujoco._things import AttachedObject, Geom, object_solid, Solid, Surface
 from dano.mujoco.kernels import words
 from dano.mujoco.kernels.words import REALS, WHOLES
 from dano.native import (
@@ -57,7 +57,7 @@ class Part(NamedTuple):
     solid: Solid
     surface: Surface | None
     scale: Float[np.ndarray, "3"]
-    thing: Thing | None
+    thing: AttachedObject | None
 
 
 def kernel_builds() -> list[tuple[Features, str]]:
@@ -70,12 +70,12 @@ def part_of_geom(body: int, geom: int, found: Geom) -> Part:
     return Part(body, geom, found.solid, found.surface, found.scale, None)
 
 
-def part_of_thing(body: int, geom: int, thing: Thing) -> Part:
+def part_of_thing(body: int, geom: int, thing: AttachedObject) -> Part:
     """An object."""
     return Part(body, geom, object_solid(thing.obj), thing.surface, np.ones(3), thing)
 
 
-class Known:
+class BridgeModel:
     """Arrays of `dano.mujoco.kernels.tables.Known` of a model, and what their kernels must know."""
 
     def __init__(
@@ -271,10 +271,10 @@ def _parts(like: Parameters, parts: Sequence[Part], at: Sequence[int]):
     return numbers, index
 
 
-class Search:
+class NearSearch:
     """The search in some data of a model: a launch with its arrays, and what it found."""
 
-    def __init__(self, mujoco: Any, model: Any, data: Any, known: Known, most: int):
+    def __init__(self, mujoco: Any, model: Any, data: Any, known: BridgeModel, most: int):
         """`most`: contacts of a pair."""
         n = len(known.pairs)
         self.rows, self.wholes = np.zeros((most * n, REALS)), np.zeros((most * n, WHOLES), np.int32)

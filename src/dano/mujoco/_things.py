@@ -263,7 +263,7 @@ _EXACT = 2e-3
 """How far from its plane a sample of a face is, in cells."""
 
 
-class Face(NamedTuple):
+class GeomFace(NamedTuple):
     """A convex flat face."""
 
     plane: Float[np.ndarray, "4"]  # Unit outward normal, and minus the offset [m]
@@ -273,7 +273,7 @@ class Face(NamedTuple):
 class Faces(NamedTuple):
     """Flat faces of an object, in a frame."""
 
-    faces: list[Face]
+    faces: list[GeomFace]
     planes: Float[np.ndarray, "f 4"]  # Of all flat faces, those that are not convex, too
     cell: float  # Of the object's grid [m]
 
@@ -290,7 +290,8 @@ class Faces(NamedTuple):
         """The same in another frame."""
         return self._replace(
             faces=[
-                Face(_moved(f.plane, rotation, origin), _moved(f.edges, rotation, origin)) for f in self.faces
+                GeomFace(_moved(f.plane, rotation, origin), _moved(f.edges, rotation, origin))
+                for f in self.faces
             ],
             planes=_moved(self.planes, rotation, origin),
         )
@@ -330,7 +331,7 @@ def faces_of(obj: objects.NeuralObject) -> Faces:
         facing = np.clip(vectors[members] @ normal, 0.0, areas[members]).sum()
         edges = _edges(points[members], normal, float(facing), _CORNER * cell)
         if edges is not None:
-            found.append(Face(plane, edges))
+            found.append(GeomFace(plane, edges))
     return Faces(found, np.array(planes).reshape(-1, 4), cell)
 
 
@@ -381,7 +382,7 @@ def _moved(
 
 
 @dataclass(frozen=True)
-class Thing:
+class AttachedObject:
     """An object on a body."""
 
     obj: objects.NeuralObject  # The object
@@ -404,7 +405,7 @@ def checked_thing(
     position: maths.Numbers,
     orientation: maths.Numbers,
     bits: tuple[int, int],
-) -> Thing:
+) -> AttachedObject:
     """What `thing_of` makes of the arguments of an `attach`.
 
     Raises:
@@ -426,8 +427,8 @@ def thing_of(
     position: Float[np.ndarray, "3"],
     orientation: Float[np.ndarray, "4"],
     bits: tuple[int, int],
-) -> Thing:
-    """An object whose field frame has a pose in the frame of its body; `bits`: see `Thing`."""
+) -> AttachedObject:
+    """An object whose field frame has a pose in the frame of its body; `bits`: see `AttachedObject`."""
     rotation = np.asarray(maths.quat_to_matrix(orientation), np.float64)
     surface = surface_of(obj.surface.points, obj.surface.vectors).moved(rotation, position)
     lower, upper = surface.points.min(axis=0), surface.points.max(axis=0)
@@ -436,7 +437,7 @@ def thing_of(
     thickness = 0.5 * float((upper - lower).min())
     if obj.solid is not None:
         thickness = min(thickness, -float(np.min(np.asarray(obj.solid.distances))))
-    return Thing(
+    return AttachedObject(
         obj=obj,
         surface=surface,
         faces=faces_of(obj).moved(rotation, position),

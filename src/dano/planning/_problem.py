@@ -224,7 +224,7 @@ class Reached(eqx.Module):
         return self.goal.error(self.scene, state) * (VIOLATION / self.goal.within)
 
 
-class Kept(eqx.Module):
+class KeptRollout(eqx.Module):
     """A limit as a constraint of every step."""
 
     scene: Scene
@@ -256,7 +256,7 @@ def problem_of(
         for goal in task.goals
         if goal.required
     ]
-    constraints += [TrajectoryConstraint(limit.name, Kept(scene, limit)) for limit in task.limits]
+    constraints += [TrajectoryConstraint(limit.name, KeptRollout(scene, limit)) for limit in task.limits]
     stage, final = StageCost(scene, task, scales, left, substeps), FinalCost(scene, task)
     return TrajectoryProblem(
         Dynamics(scene, task, scales, engine, prepared, left, substeps),

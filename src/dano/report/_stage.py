@@ -113,7 +113,7 @@ def check_run(scene: Scene, trajectory: Trajectory, name: str = "trajectory") ->
         raise ValueError(f"{name} must be finite, got positions that are NaN or infinite")
 
 
-class Stage(NamedTuple):
+class PictureStage(NamedTuple):
     """What of a scene is drawn."""
 
     items: list[Item]  # One per drawable body, at the identity
@@ -138,7 +138,7 @@ class Stage(NamedTuple):
 
 def stage(
     scene: Scene, colours: Mapping[str, str] | None = None, looks: Mapping[str, LearnedField] | None = None
-) -> Stage:
+) -> PictureStage:
     """Make the bodies of a scene ready for drawing; bodies without a field or shape are left out.
 
     Raises:
@@ -167,7 +167,7 @@ def stage(
         raise ValueError(
             f"scene must hold a body with a field or a shape, got {list(scene.names)} without any"
         )
-    return Stage(items, rows, offsets)
+    return PictureStage(items, rows, offsets)
 
 
 def level_of(body: Body) -> float | None:
@@ -395,7 +395,7 @@ class Seen(NamedTuple):
 
 def seen_of(
     scene: Scene,
-    drawn: Stage,
+    drawn: PictureStage,
     position: Float[np.ndarray, "frames bodies 3"],
     orientation: Float[np.ndarray, "frames bodies 4"],
 ) -> Seen:
@@ -434,7 +434,7 @@ def together(runs: Sequence[Seen]) -> Seen:
     )
 
 
-def camera_for(scene: Scene, drawn: Stage, trajectory: Trajectory, width: int, height: int) -> Camera:
+def camera_for(scene: Scene, drawn: PictureStage, trajectory: Trajectory, width: int, height: int) -> Camera:
     """A camera that sees every bounded body all the time, from across the main direction of motion."""
     position = np.asarray(trajectory.states.position, dtype=np.float64)
     orientation = np.asarray(trajectory.states.orientation, dtype=np.float64)

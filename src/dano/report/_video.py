@@ -25,11 +25,11 @@ from dano.report._stage import (
     draw_touches,
     frame_times,
     moments_of,
+    PictureStage,
     poses_at,
     Seen,
     seen_of,
     side_by_side,
-    Stage,
     stage,
     together,
     Touches,
@@ -114,7 +114,7 @@ class Take(NamedTuple):
     """A run as a film shows it: what is drawn of it, and where that is in each frame."""
 
     seen: Seen  # What the camera keeps in view
-    drawn: Stage  # Bodies
+    drawn: PictureStage  # Bodies
     times: Float[np.ndarray, " frames"]  # Of the frames [s]
     position: Float[np.ndarray, "frames bodies 3"]  # Of the centres of mass [m, W]
     orientation: Float[np.ndarray, "frames bodies 4"]  # Of the bodies
@@ -342,7 +342,9 @@ def check_film(
     return checked[0], checked[1]
 
 
-def take_of(scene: Scene, trajectory: Trajectory, drawn: Stage, count: int, options: VideoOptions) -> Take:
+def take_of(
+    scene: Scene, trajectory: Trajectory, drawn: PictureStage, count: int, options: VideoOptions
+) -> Take:
     """A run at the times of so many frames; after its end it stands still."""
     since = np.arange(count) / (options.fps * options.slow_motion)
     known = np.asarray(trajectory.times, dtype=np.float64)
@@ -428,7 +430,7 @@ class _Extents(NamedTuple):
     reach: Float[np.ndarray, " items"]  # Farthest point from the centre of mass [m]
 
     @classmethod
-    def of(cls, stage: Stage) -> "_Extents":
+    def of(cls, stage: PictureStage) -> "_Extents":
         offset = np.linalg.norm(np.reshape(stage.offsets, (-1, 3)), axis=1)
         return cls(
             np.array([item.plane is None for item in stage.items], dtype=bool),

@@ -147,7 +147,7 @@ class Finding(NamedTuple):
     text: str
 
 
-class Bound(NamedTuple):
+class SpeedBound(NamedTuple):
     """Largest motion of a body, see the module."""
 
     speed: float  # Of its centre of mass [m/s]
@@ -155,7 +155,7 @@ class Bound(NamedTuple):
     falls: bool  # Whether nothing that it may touch is fixed below it
 
 
-def bounds(scene: Scene, state: State, duration: float) -> list[Bound]:
+def bounds(scene: Scene, state: State, duration: float) -> list[SpeedBound]:
     """Largest motion of each body, from the initial state and the height that it can fall."""
     gravity = np.asarray(scene.gravity, np.float64)
     strength = float(np.linalg.norm(gravity))
@@ -163,7 +163,7 @@ def bounds(scene: Scene, state: State, duration: float) -> list[Bound]:
     for i, body in enumerate(scene.bodies):
         speed, spin = (float(np.linalg.norm(np.asarray(x[i]))) for x in (state.velocity, state.omega))
         if body.fixed or i not in scene.layout.free or strength == 0.0:
-            found.append(Bound(0.0 if body.fixed else speed, 0.0 if body.fixed else spin, False))
+            found.append(SpeedBound(0.0 if body.fixed else speed, 0.0 if body.fixed else spin, False))
             continue
         down = gravity / strength
         partners = _fixed_partners(scene, i)
@@ -171,7 +171,7 @@ def bounds(scene: Scene, state: State, duration: float) -> list[Bound]:
         falls = not heights
         gained = strength * duration if falls else 0.0
         reached = speed + gained if falls else math.sqrt(speed**2 + 2 * strength * min(heights))
-        found.append(Bound(reached, spin, falls))
+        found.append(SpeedBound(reached, spin, falls))
     return found
 
 
@@ -207,7 +207,7 @@ def _height(scene: Scene, state: State, i: int, other: int, down: np.ndarray) ->
     return max(inside, 0.0) / closing if is_above and closing > 0.05 else None
 
 
-def forecast(scene: Scene, state: State, limits: list[Bound]) -> list[Finding]:
+def forecast(scene: Scene, state: State, limits: list[SpeedBound]) -> list[Finding]:
     """What will not be resolved, from numbers alone."""
     return [
         *support(scene, limits),
@@ -219,7 +219,7 @@ def forecast(scene: Scene, state: State, limits: list[Bound]) -> list[Finding]:
     ]
 
 
-def support(scene: Scene, limits: list[Bound]) -> list[Finding]:
+def support(scene: Scene, limits: list[SpeedBound]) -> list[Finding]:
     """Bodies that touch nothing, or have nothing below."""
     touched = {name for pair in scene.pairs for name in pair}
     found = []
@@ -256,7 +256,7 @@ def fast_spin(name: str, verb: str, spin: float, h: float) -> Finding:
     )
 
 
-def _pair(scene: Scene, state: State, contact: Contact, limits: list[Bound]) -> list[Finding]:
+def _pair(scene: Scene, state: State, contact: Contact, limits: list[SpeedBound]) -> list[Finding]:
     a, b = scene.index(contact.a), scene.index(contact.b)
     return [*_impact(scene, contact, limits[a].speed + limits[b].speed), *_wall(scene, contact, limits)]
 
@@ -305,7 +305,7 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
     ]
 
 
-def _wall(scene: Scene, contact: Contact, limits: list[Bound]) -> list[Finding]:
+def _wall(scene: Scene, contact: Contact, limits: list[SpeedBound]) -> list[Finding]:
     h = float(scene.timestep)
     a, b = (scene.index(name) for name in (contact.a, contact.b))
     way = (limits[a].speed + limits[b].speed) * h

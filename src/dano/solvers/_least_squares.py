@@ -48,7 +48,7 @@ class BoxMinimum(NamedTuple):
     factor: Float[Array, "m m"]
 
 
-class _Search(NamedTuple):
+class _BoxSearch(NamedTuple):
     k: Float[Array, " m"]
     steps: Array
     moving: Array
@@ -81,7 +81,7 @@ def box_minimum(
     def free(k, slope):
         return ~(((k <= lower) & (slope > 0)) | ((k >= upper) & (slope < 0)))
 
-    def step(search: _Search) -> _Search:
+    def step(search: _BoxSearch) -> _BoxSearch:
         k = search.k
         slope = gradient + hessian @ k
         inside = free(k, slope)
@@ -103,9 +103,9 @@ def box_minimum(
         moved = jnp.where(better, best, k)
         after = gradient + hessian @ moved
         moving = better & jnp.any(jnp.where(free(moved, after), jnp.abs(after), 0) > floor)
-        return _Search(moved, search.steps + 1, moving)
+        return _BoxSearch(moved, search.steps + 1, moving)
 
-    first = _Search(jnp.clip(start, lower, upper), jnp.asarray(0), jnp.asarray(True))
+    first = _BoxSearch(jnp.clip(start, lower, upper), jnp.asarray(0), jnp.asarray(True))
     k = jax.lax.while_loop(lambda s: s.moving & (s.steps < _MOST_STEPS), step, first).k
     inside = free(k, gradient + hessian @ k)
     return BoxMinimum(k, inside, _factor(hessian, inside))

@@ -7,7 +7,7 @@ from tyro.conf import Positional
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckScene:
     """Say what a scene will do before a long run: contact law, step, what is not resolved, what it costs."""
 
     # A scene file (.toml), or a neural object (.dano) that would be dropped onto a floor.

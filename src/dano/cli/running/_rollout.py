@@ -31,7 +31,7 @@ _FORM = "dano-checkpoint", 1
 _REPORTED = ("residuals", "iterations", "converged")
 
 
-class Checkpoint:
+class RunCheckpoint:
     """Pieces of a run on disk.
 
     Attributes:
@@ -182,7 +182,7 @@ def roll_out(
     loaded: SceneFile,
     progress: Progress,
     clock: Clock,
-    kept: Checkpoint | None = None,
+    kept: RunCheckpoint | None = None,
     *,
     resume: bool = False,
 ) -> Rollout:

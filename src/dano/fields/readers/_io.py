@@ -76,7 +76,7 @@ def _buffers(path: Path) -> list[str]:
     return [unquote(place) for place in places if not place.startswith("data:")]
 
 
-class _Reader(NamedTuple):
+class _Format(NamedTuple):
     """How a kind of file is read."""
 
     read: Callable[..., AbstractField]  # Takes the path and the options
@@ -96,17 +96,17 @@ _CHECKPOINT = (
     "log2_hashmap_size",
     "disable_scene_contraction",
 )
-_MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge", "up"))
-_SPLATS = _Reader(load_splats, ("min_width", "skip_nan", "box", "sphere"), crops=True)
-_READERS: dict[str, _Reader] = {
-    ".npz": _Reader(load_npz, ("interpolation",)),
-    ".npy": _Reader(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
-    ".dano": _Reader(load_object, ("interpolation",)),
+_MESH = _Format(mesh_field, ("resolution", "interpolation", "edge", "up"))
+_SPLATS = _Format(load_splats, ("min_width", "skip_nan", "box", "sphere"), crops=True)
+_READERS: dict[str, _Format] = {
+    ".npz": _Format(load_npz, ("interpolation",)),
+    ".npy": _Format(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
+    ".dano": _Format(load_object, ("interpolation",)),
     **dict.fromkeys(MESH_SUFFIXES, _MESH),
-    ".ckpt": _Reader(load_checkpoint, _CHECKPOINT, crops=True),
-    **dict.fromkeys((".ingp", ".msgpack"), _Reader(load_snapshot, ("cascade", "interpolation"), crops=True)),
-    **dict.fromkeys((".vdb", ".nvdb"), _Reader(load_vdb, ("grid", "interpolation"), crops=True)),
-    **dict.fromkeys((".pt", ".pth", ".pt2"), _Reader(load_module, ("module",), crops=True)),
+    ".ckpt": _Format(load_checkpoint, _CHECKPOINT, crops=True),
+    **dict.fromkeys((".ingp", ".msgpack"), _Format(load_snapshot, ("cascade", "interpolation"), crops=True)),
+    **dict.fromkeys((".vdb", ".nvdb"), _Format(load_vdb, ("grid", "interpolation"), crops=True)),
+    **dict.fromkeys((".pt", ".pth", ".pt2"), _Format(load_module, ("module",), crops=True)),
 }
 
 

@@ -374,7 +374,7 @@ _TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 """Columns of trajectories of the TUM RGB-D benchmark, which have no header."""
 
 
-class Table(NamedTuple):
+class LogTable(NamedTuple):
     """Cells of a table as text."""
 
     source: Path  # The file, for messages
@@ -417,7 +417,7 @@ class Table(NamedTuple):
         return np.array(shifted), first
 
 
-def read_table(source: Path) -> Table:
+def read_table(source: Path) -> LogTable:
     """Read a table of text.
 
     Cells are separated by commas, semicolons (then numbers may have decimal commas), tabs or blanks. The
@@ -459,7 +459,7 @@ def read_table(source: Path) -> Table:
             raise ValueError(
                 f"{source}: row {k + 1} (line {i}) must hold {len(header)} cells, got {len(row)}"
             )
-    return Table(source, header, [row for _, row in rows], [i for i, _ in rows])
+    return LogTable(source, header, [row for _, row in rows], [i for i, _ in rows])
 
 
 def _separator(lines: Sequence[str]) -> str:

@@ -286,7 +286,7 @@ def wrench_table(moved: Twists, gravity: np.ndarray) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Fit:
+class LoadFit:
     """Where weighted least squares ended: θ, its covariance, directions without data, noise, χ²."""
 
     theta: np.ndarray
@@ -297,7 +297,7 @@ class Fit:
     inflation: float
 
 
-def fitted(rows: Rows, noise: np.ndarray | None = None) -> Fit:
+def fitted(rows: Rows, noise: np.ndarray | None = None) -> LoadFit:
     """Least squares with weights from the residuals, or from a noise that is known."""
     n, _, p = rows.table.shape
     counts = np.bincount(rows.kinds)
@@ -322,7 +322,7 @@ def fitted(rows: Rows, noise: np.ndarray | None = None) -> Fit:
             sums = np.bincount(rows.kinds, np.sum(residuals**2, axis=0))
             sigma = np.maximum(np.sqrt(sums / free), 1e-12)
     chi2 = float(np.sum((residuals / sigma[rows.kinds]) ** 2))
-    return Fit(theta, covariance, null, sigma, chi2, _inflation(residuals))
+    return LoadFit(theta, covariance, null, sigma, chi2, _inflation(residuals))
 
 
 def _inflation(residuals: np.ndarray) -> float:
@@ -333,7 +333,7 @@ def _inflation(residuals: np.ndarray) -> float:
     return (1 + correlation) / (1 - correlation)
 
 
-def drifting(rows: Rows, fit: Fit) -> tuple[Rows, Fit, np.ndarray | None]:
+def drifting(rows: Rows, fit: LoadFit) -> tuple[Rows, LoadFit, np.ndarray | None]:
     """The model and its fit with a bias that changes with time, where that is seen.
 
     It is a polynomial of the time, of the first degree, or of the third or fifth where these fit better by
@@ -363,7 +363,7 @@ def drifting(rows: Rows, fit: Fit) -> tuple[Rows, Fit, np.ndarray | None]:
     return rows, fit, change
 
 
-def check_slip(rows: Rows, fit: Fit, times: np.ndarray) -> None:
+def check_slip(rows: Rows, fit: LoadFit, times: np.ndarray) -> None:
     """Refuse a load that slips.
 
     Args:
@@ -390,7 +390,10 @@ def check_slip(rows: Rows, fit: Fit, times: np.ndarray) -> None:
 
 
 def load_of(
-    fit: Fit, messages: list[str], bodies: np.ndarray | None, sensor: Callable[[np.ndarray], dict[str, Any]]
+    fit: LoadFit,
+    messages: list[str],
+    bodies: np.ndarray | None,
+    sensor: Callable[[np.ndarray], dict[str, Any]],
 ) -> Load:
     """Values, errors, and what is not observed.
 
@@ -462,7 +465,7 @@ def _check_within(values: np.ndarray, errors: np.ndarray, bodies: np.ndarray) ->
         )
 
 
-def _lost(fit: Fit, values: np.ndarray, errors: np.ndarray) -> dict[str, bool]:
+def _lost(fit: LoadFit, values: np.ndarray, errors: np.ndarray) -> dict[str, bool]:
     """What is not observed: what no data depend on, and what is not known to a quarter of its size."""
     mass, centre, trace = values[0], values[1:4], abs(values[4:7].sum())
     size = max(np.linalg.norm(centre), np.sqrt(trace / 2 / max(mass, 1e-12)))

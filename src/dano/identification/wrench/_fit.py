@@ -15,10 +15,10 @@ from dano.checks import checked_kind, checked_text
 from dano.identification.wrench._estimate import (
     check_slip,
     drifting,
-    Fit,
     fitted,
     Load,
     load_of,
+    LoadFit,
     point_masses,
     Rows,
     shares,
@@ -293,7 +293,7 @@ def _rows(log: WristLog, moved: Twists, gravity: np.ndarray) -> Rows:
     return Rows(shares(log.times, rows), readings, table, np.repeat([0, 1], 3))
 
 
-def _sensor(fit: Fit, theta: np.ndarray, drift: np.ndarray) -> dict[str, Any]:
+def _sensor(fit: LoadFit, theta: np.ndarray, drift: np.ndarray) -> dict[str, Any]:
     """Bias, drift and noise, as fields of a load."""
     return {
         "force_bias": theta[10:13],
@@ -310,7 +310,7 @@ def _turns(moved: Twists) -> bool:
     return bool(2 * np.arccos(np.clip(cosine.min(), 0, 1)) > 0.2)
 
 
-def _check(log: WristLog, rows: Rows, fit: Fit) -> None:
+def _check(log: WristLog, rows: Rows, fit: LoadFit) -> None:
     """Refuse torques in other units, and loads that slip.
 
     Raises:
@@ -329,7 +329,7 @@ def _check(log: WristLog, rows: Rows, fit: Fit) -> None:
     check_slip(rows, fit, log.times)
 
 
-def _check_units(rows: Rows, fit: Fit) -> None:
+def _check_units(rows: Rows, fit: LoadFit) -> None:
     """Refuse torques of a centre of mass that is much further away, or nearer, than that of the forces.
 
     Raises:

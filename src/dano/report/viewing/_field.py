@@ -100,7 +100,7 @@ def _check(field: AbstractField, level: float | None) -> None:
             raise ValueError(f"level applies to densities, got {level} for a {type(field).__name__}")
 
 
-class Surface:
+class FieldSurface:
     """The surface of a field at any level (host)."""
 
     level: float | None  # Density of the surface when the page opens; None for a solid
@@ -157,7 +157,7 @@ def _sampled(
     return grid, values, usual_level(values), float(values.max())
 
 
-class _Samples(NamedTuple):
+class _FieldSamples(NamedTuple):
     values: Float[np.ndarray, "nx ny nz"]
     origin: Float[np.ndarray, "3"]
     spacing: Float[np.ndarray, "3"]
@@ -165,7 +165,7 @@ class _Samples(NamedTuple):
 
 def _cropped(
     values: Float[np.ndarray, "nx ny nz"], grid: GridField | SignedDistanceGrid, least: float
-) -> _Samples:
+) -> _FieldSamples:
     """The part that reaches a value, no finer than is drawn, and with less around it."""
     inside = np.argwhere(values >= least)
     low, high = np.maximum(inside.min(axis=0) - 1, 0), inside.max(axis=0) + 2
@@ -180,7 +180,7 @@ def _cropped(
         spacing = spacing * step
     # Beyond its bounds a field is zero: a surface that reaches them is closed there.
     empty = min(0.0, 2 * least, float(part.min()))
-    return _Samples(np.pad(part, 1, constant_values=empty), origin - spacing, spacing)
+    return _FieldSamples(np.pad(part, 1, constant_values=empty), origin - spacing, spacing)
 
 
 class _ShownField:
@@ -195,7 +195,7 @@ class _ShownField:
 
     def __init__(self, server: Any, field: AbstractField, level: float | None):
         self._server = server
-        self.surface = Surface(field, level)
+        self.surface = FieldSurface(field, level)
         self._busy = threading.Lock()
         self._text: Any = None
         server.scene.set_up_direction("+z")

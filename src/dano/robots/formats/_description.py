@@ -122,7 +122,7 @@ class Lacking:
     text: str  # What the file says
 
 
-class Meeting(NamedTuple):
+class GeomPair(NamedTuple):
     """Two links that touch each other."""
 
     frictions: tuple[float, ...]  # Sliding frictions of their shapes, different ones
@@ -145,7 +145,7 @@ class Description:
     notes: tuple[str, ...] = ()  # What was read in another way than it is written, one line each
     keyframes: dict[str, Keyframe] = field(default_factory=dict)  # States that the file names
     # Which links touch each other; None where the format does not say.
-    meets: dict[frozenset[str], Meeting] | None = None
+    meets: dict[frozenset[str], GeomPair] | None = None
     silent: tuple[str, ...] = ()  # What is not read and changes how it is simulated, one line each
 
     def link(self, name: str) -> Link:

@@ -24,11 +24,11 @@ from dano.robots.formats._description import (
     Description,
     displaced,
     Drive,
+    GeomPair,
     held_at,
     Keyframe,
     Lacking,
     Link,
-    Meeting,
     Placed,
     Solid,
     Tie,
@@ -70,7 +70,7 @@ def keyframes_of(
 
 def meets_of(
     model: Any, mujoco: Any, links: Sequence[str]
-) -> tuple[dict[frozenset[str], Meeting], list[str]]:
+) -> tuple[dict[frozenset[str], GeomPair], list[str]]:
     """Who touches whom, and what of that is read otherwise than MuJoCo does, one line each.
 
     Args:
@@ -93,7 +93,7 @@ def meets_of(
             friction[pair] = slides
     if int(model.opt.enableflags) & int(mujoco.mjtEnableBit.mjENBL_OVERRIDE):
         friction = np.where(friction > 0, float(model.opt.o_friction[0]), 0.0)
-    found: dict[frozenset[str], Meeting] = {}
+    found: dict[frozenset[str], GeomPair] = {}
     rows = {name: np.flatnonzero(np.array(links) == name) for name in dict.fromkeys(links)}
     touching = np.asarray(may.any(axis=1))
     parted = []
@@ -104,7 +104,7 @@ def meets_of(
             if not may[block].any():
                 continue
             slides = tuple(np.unique(friction[block][may[block]]).tolist())
-            found[frozenset((first, second))] = Meeting(slides, bool(named[block].any()))
+            found[frozenset((first, second))] = GeomPair(slides, bool(named[block].any()))
             both = np.ix_(rows[first][touching[rows[first]]], rows[second][touching[rows[second]]])
             if not may[both].all():
                 parted.append(f"{first} and {second}")
@@ -294,10 +294,10 @@ def read_mjcf(path: Path, *, balance_inertia: bool = False) -> Description:
         hint = ": balance_inertia=True does that" if "balanceinertia" in str(error) else ""
         said = " ".join(str(error).split())
         raise ValueError(f"{path} must be a file that MuJoCo reads: {said}{hint}") from error
-    return _Reader(path, model, mujoco).description()
+    return _MjcfReader(path, model, mujoco).description()
 
 
-class _Reader:
+class _MjcfReader:
     """Reads rows of MuJoCo's model."""
 
     def __init__(self, path: Path, model: Any, mujoco: Any):

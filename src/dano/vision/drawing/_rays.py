@@ -42,7 +42,7 @@ _BLOCK = 16
 _FEW, _SHARES = 512, 4
 
 
-class Thing(NamedTuple):
+class TracedItem(NamedTuple):
     """A solid somewhere (host only)."""
 
     shape: AbstractShape  # Its signed distance, bounded
@@ -67,7 +67,7 @@ class Tracer:
     """Finds what rays from one point meet."""
 
     def __init__(
-        self, things: Sequence[Thing], planes: Sequence[np.ndarray], origin: np.ndarray, **numbers: Any
+        self, things: Sequence[TracedItem], planes: Sequence[np.ndarray], origin: np.ndarray, **numbers: Any
     ):
         """Make a view of things.
 

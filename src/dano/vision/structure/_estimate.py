@@ -41,7 +41,7 @@ from dano.vision.structure._gauge import (
     Up,
     world_frame,
 )
-from dano.vision.structure._mapping import find_models, Lens, Model
+from dano.vision.structure._mapping import find_models, Lens, SparseModel
 from dano.vision.structure._markers import detect_markers, place_markers, PlacedMarker
 from dano.vision.structure._options import FEWEST, PoseOptions
 from dano.vision.structure._photographs import (
@@ -315,7 +315,7 @@ def _result(
     photographs: list[Photograph],
     left_out: list[tuple[str, str]],
     matches: Matches,
-    models: list[Model],
+    models: list[SparseModel],
     options: PoseOptions,
     on: str,
     told: Progress,
@@ -357,7 +357,7 @@ def _result(
 
 
 def _pictures(
-    shown: list[Photograph], cameras: list[PosedCamera], model: Model, frame: Similarity
+    shown: list[Photograph], cameras: list[PosedCamera], model: SparseModel, frame: Similarity
 ) -> tuple[PosedPicture, ...]:
     pictures = []
     for i, (photograph, camera) in enumerate(zip(shown, cameras, strict=True)):
@@ -427,7 +427,7 @@ def _up(
     shown: list[Photograph],
     cameras: list[PosedCamera],
     markers: list[PlacedMarker],
-    model: Model,
+    model: SparseModel,
     options: PoseOptions,
     warnings: list[str],
 ) -> Up:
@@ -449,7 +449,7 @@ def _up(
     return up
 
 
-def _around_object(shown: list[Photograph], model: Model) -> np.ndarray:
+def _around_object(shown: list[Photograph], model: SparseModel) -> np.ndarray:
     """Points that most pictures show beside the object; all where there are no masks."""
     inside, count = np.zeros(len(model.points)), np.zeros(len(model.points))
     for i, photograph in enumerate(shown):
