@@ -11,7 +11,7 @@ from dano import vision
 from dano.archive import write_json
 from dano.cli._arguments import CheckPhotographs, Poses, Train
 from dano.cli._console import numbers, Progress, put, put_json, say
-from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
+from dano.cli._outputs import check_distinct, check_output, chosen, missing_for_pictures
 from dano.cli.tracking.filming import focal_of
 from dano.fields import save_field
 from dano.learning import LearnedObject, train_object
@@ -21,23 +21,8 @@ from dano.objects import NeuralObject
 def poses(command: Poses) -> None:
     """See `dano poses --help`."""
     check_output(command.output, command.images, suffix=".json")
-    options = vision.PoseOptions(
-        focal=focal_of(command.focal),
-        centre=command.centre,
-        distortion=command.distortion,
-        lens=command.lens,
-        features_on=command.features_on,
-        features=command.features,
-        marker_size=command.marker_size,
-        marker_family=command.marker_family,
-        known_length=_known_length(command),
-        up=command.up,
-        frames=command.frames,
-        since=command.since,
-        until=command.until,
-        model=command.model,
-        seed=command.seed,
-    )
+    lens = {"focal": focal_of(command.focal), "known_length": _known_length(command)}
+    options = chosen(vision.PoseOptions, command, **lens)
     progress = Progress()
     found = vision.estimate_poses(
         [command.images, *command.further] if command.further else command.images,
@@ -231,13 +216,7 @@ def print_data(report: dict[str, Any]) -> None:
 
 def train(command: Train) -> None:
     """See `dano train --help`."""
-    options = vision.TrainOptions(
-        resolution=command.resolution,
-        iterations=command.iterations,
-        batch=command.batch,
-        seconds=command.seconds,
-        seed=command.seed,
-    )
+    options = chosen(vision.TrainOptions, command)
     outputs = _outputs(command.output)
     for path in outputs.values():
         check_output(path)

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from dano.archive import checked_output
 from dano.cli._arguments import (
@@ -19,6 +19,8 @@ from dano.cli._arguments import (
 )
 from dano.cli.tracking import Track
 from dano.extras import is_installed
+
+Options = TypeVar("Options")
 
 _NAMED_AFTER: dict[type, tuple[str, str]] = {
     Train: ("images", ".dano"),
@@ -55,6 +57,18 @@ def named(command: Any) -> tuple[Any, str | None]:
     output = usual if getattr(fields, "resume", False) else free_path(usual)
     line = f"wrote {output}" + ("" if output == usual else f", because {usual} was there already")
     return dataclasses.replace(fields, output=output), line
+
+
+def chosen(options: type[Options], command: Any, **given: Any) -> Options:
+    """Options of a part of dano, from those of a command that have the same names.
+
+    Args:
+        options: Their class.
+        command: The command, or a group of its options.
+        **given: Those that are called or written otherwise.
+    """
+    names = {field.name for field in dataclasses.fields(options)} & vars(command).keys()
+    return options(**{name: getattr(command, name) for name in names} | given)
 
 
 def run_files(folder: Path, scenes: Sequence[Path], *, resume: bool) -> list[Path]:

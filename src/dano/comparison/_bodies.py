@@ -224,17 +224,11 @@ class Rigid(NamedTuple):
 
 
 class Drop(NamedTuple):
-    """How a body is let go.
+    """How a body is let go."""
 
-    Attributes:
-        origin: Of the field frame [m, W], shape (3,).
-        orientation: F → W, wxyz, shape (4,).
-        omega: Angular velocity [rad/s, F], shape (3,).
-    """
-
-    origin: Float[np.ndarray, "3"]
-    orientation: Float[np.ndarray, "4"]
-    omega: Float[np.ndarray, "3"]
+    origin: Float[np.ndarray, "3"]  # Of the field frame [m, W], shape (3,)
+    orientation: Float[np.ndarray, "4"]  # F → W, wxyz, shape (4,)
+    omega: Float[np.ndarray, "3"]  # Angular velocity [rad/s, F], shape (3,)
 
 
 class Path(NamedTuple):
@@ -252,21 +246,13 @@ class Path(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """The solid that others are measured against.
+    """The solid that others are measured against."""
 
-    Attributes:
-        moments: Volume, centroid, inertia per density.
-        points: On its surface [m, F], shape (n, 3).
-        normals: Unit outward normals there, shape (n, 3).
-        hull: Its convex hull.
-        size: Largest extent [m].
-    """
-
-    moments: exchange.Moments
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    hull: exchange.Triangles
-    size: float
+    moments: exchange.Moments  # Volume, centroid, inertia per density
+    points: Float[np.ndarray, "n 3"]  # On its surface [m, F], shape (n, 3)
+    normals: Float[np.ndarray, "n 3"]  # Unit outward normals there, shape (n, 3)
+    hull: exchange.Triangles  # Its convex hull
+    size: float  # Largest extent [m]
 
 
 class Probes(NamedTuple):

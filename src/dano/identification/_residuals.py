@@ -25,16 +25,13 @@ class WindowStart(NamedTuple):
 
     Unknowns are, body by body, three numbers of each quantity, then coordinates of the joints, then their
     velocities.
-
-    Attributes:
-        free: Bodies that were observed and move freely.
-        turning: Of each joint coordinate whether it is an angle; none if no body on a joint was observed.
-        initial: Quantities that are estimated. Coordinates of joints are with positions or orientations,
-            their velocities with velocities or spins.
     """
 
-    free: tuple[int, ...]
+    free: tuple[int, ...]  # Bodies that were observed and move freely
+    # Of each joint coordinate whether it is an angle; none if no body on a joint was observed.
     turning: tuple[bool, ...]
+    # Quantities that are estimated. Coordinates of joints are with positions or orientations, their
+    # velocities with velocities or spins.
     initial: tuple[str, ...]
 
     @property

@@ -175,27 +175,16 @@ class Windows(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Windows, and what the host knows of them.
+    """Windows, and what the host knows of them."""
 
-    Attributes:
-        windows: The windows.
-        start: Their initial states, positions as `Windows.origins` says.
-        n_steps: Steps that each is simulated.
-        owner: Index of the motion that each belongs to.
-        rows: The frames of the motion that each covers.
-        bodies: Indices of the bodies that were observed and move.
-        quantities: Quantities that count.
-        n_data: How many numbers were observed and count.
-    """
-
-    windows: Windows
-    start: State
-    n_steps: int
-    owner: np.ndarray
-    rows: list[np.ndarray]
-    bodies: tuple[int, ...]
-    quantities: tuple[str, ...]
-    n_data: int
+    windows: Windows  # The windows
+    start: State  # Their initial states, positions as `Windows.origins` says
+    n_steps: int  # Steps that each is simulated
+    owner: np.ndarray  # Index of the motion that each belongs to
+    rows: list[np.ndarray]  # The frames of the motion that each covers
+    bodies: tuple[int, ...]  # Indices of the bodies that were observed and move
+    quantities: tuple[str, ...]  # Quantities that count
+    n_data: int  # How many numbers were observed and count
 
 
 def plan_windows(

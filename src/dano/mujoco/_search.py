@@ -41,23 +41,14 @@ Those of a ball turn to what is nearest; with several feet on it, that is one af
 
 
 class Part(NamedTuple):
-    """A geom or an object.
+    """A geom or an object."""
 
-    Attributes:
-        body: Body that it moves with.
-        geom: Geom that it is, or that stands for the object.
-        solid: Its solid.
-        surface: Samples that press on others; None for none.
-        scale: Factors of samples on the unit ball [m].
-        thing: The object, None for a geom.
-    """
-
-    body: int
-    geom: int
-    solid: Solid
-    surface: Surface | None
-    scale: Float[np.ndarray, "3"]
-    thing: AttachedObject | None
+    body: int  # Body that it moves with
+    geom: int  # Geom that it is, or that stands for the object
+    solid: Solid  # Its solid
+    surface: Surface | None  # Samples that press on others; None for none
+    scale: Float[np.ndarray, "3"]  # Factors of samples on the unit ball [m]
+    thing: AttachedObject | None  # The object, None for a geom
 
 
 def kernel_builds() -> list[tuple[Features, str]]:

@@ -141,31 +141,19 @@ _FAR = 1e30
 
 
 class Solid(NamedTuple):
-    """What samples of others press on, in a frame of its own.
+    """What samples of others press on, in a frame of its own."""
 
-    Attributes:
-        kind: Name of a kind in `dano.physics.solids.distances` or `dano.mujoco.kernels.solids`.
-        sizes: As `dano.physics.solids.distances.Leaf` has them [m].
-        thickness: Half of what is to be gone through at the thickest place [m].
-        spacing: Between the nodes of a grid [m].
-        coefficients: Of the spline of a grid [m].
-        degree: Of the spline.
-        planes: Unit outward normal and offset [m] of the faces of a hull, shape (f, 4).
-        field: Of a height field, its number.
-        bend: Least radius of curvature of a shape without edges, 0 for others [m].
-        error: Why a geom may not touch an object.
-    """
-
-    kind: str
-    sizes: Float[np.ndarray, "3"] = np.zeros(3)
-    thickness: float = _FAR
-    spacing: Float[np.ndarray, "3"] = np.zeros(3)
-    coefficients: Float[np.ndarray, "nx ny nz"] | None = None
-    degree: int = 0
+    kind: str  # Name of a kind in `dano.physics.solids.distances` or `dano.mujoco.kernels.solids`
+    sizes: Float[np.ndarray, "3"] = np.zeros(3)  # As `dano.physics.solids.distances.Leaf` has them [m]
+    thickness: float = _FAR  # Half of what is to be gone through at the thickest place [m]
+    spacing: Float[np.ndarray, "3"] = np.zeros(3)  # Between the nodes of a grid [m]
+    coefficients: Float[np.ndarray, "nx ny nz"] | None = None  # Of the spline of a grid [m]
+    degree: int = 0  # Of the spline
+    # Unit outward normal and offset [m] of the faces of a hull, shape (f, 4).
     planes: Float[np.ndarray, "f 4"] | None = None
-    field: int = 0
-    bend: float = 0.0
-    error: str = ""
+    field: int = 0  # Of a height field, its number
+    bend: float = 0.0  # Least radius of curvature of a shape without edges, 0 for others [m]
+    error: str = ""  # Why a geom may not touch an object
 
 
 class Geom(NamedTuple):

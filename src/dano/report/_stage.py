@@ -375,17 +375,11 @@ _CALM = (0.5, 0.35, 0.25, 0.17, 0.12, 0.08, 0.05, 0.03)
 
 
 class Seen(NamedTuple):
-    """What cameras keep in view.
+    """What cameras keep in view."""
 
-    Attributes:
-        moving: Points on bodies that may move [m, W] in each frame.
-        still: Points on fixed bodies [m, W].
-        paths: Centres of mass [m, W] of each body that may move.
-    """
-
-    moving: Float[np.ndarray, "frames n 3"]
-    still: Float[np.ndarray, "m 3"]
-    paths: list[Float[np.ndarray, "frames 3"]]
+    moving: Float[np.ndarray, "frames n 3"]  # Points on bodies that may move [m, W] in each frame
+    still: Float[np.ndarray, "m 3"]  # Points on fixed bodies [m, W]
+    paths: list[Float[np.ndarray, "frames 3"]]  # Centres of mass [m, W] of each body that may move
 
     @property
     def points(self) -> Float[np.ndarray, "k 3"]:

@@ -57,33 +57,19 @@ class Policy(NamedTuple):
 
 
 class IlqrIterate(NamedTuple):
-    """What goes around the loop.
+    """What goes around the loop."""
 
-    Attributes:
-        states: x.
-        controls: u.
-        value: L.
-        model: Around this trajectory, or the one before until it is renewed.
-        policy: Of the last backward pass.
-        rho: Regularisation ρ.
-        gap_weight: Weight of the gaps in the merit L + w Σ|d|.
-        fresh: Whether the model is of this trajectory.
-        slow: Steps in a row that brought less than the tolerance.
-        iterations: So far.
-        status: RUNNING, CONVERGED or STUCK.
-    """
-
-    states: Any
-    controls: Float[Array, "T m"]
-    value: Float[Array, ""]
-    model: Model
-    policy: Policy
-    rho: Float[Array, ""]
-    gap_weight: Float[Array, ""]
-    fresh: Bool[Array, ""]
-    slow: Int[Array, ""]
-    iterations: Int[Array, ""]
-    status: Int[Array, ""]
+    states: Any  # x
+    controls: Float[Array, "T m"]  # u
+    value: Float[Array, ""]  # L
+    model: Model  # Around this trajectory, or the one before until it is renewed
+    policy: Policy  # Of the last backward pass
+    rho: Float[Array, ""]  # Regularisation ρ
+    gap_weight: Float[Array, ""]  # Weight of the gaps in the merit L + w Σ|d|
+    fresh: Bool[Array, ""]  # Whether the model is of this trajectory
+    slow: Int[Array, ""]  # Steps in a row that brought less than the tolerance
+    iterations: Int[Array, ""]  # So far
+    status: Int[Array, ""]  # RUNNING, CONVERGED or STUCK
 
 
 class Multipliers(NamedTuple):

@@ -16,7 +16,7 @@ from dano import scene_file
 from dano.archive import checked_output, write_text
 from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
-from dano.cli._outputs import missing_for_pictures
+from dano.cli._outputs import chosen, missing_for_pictures
 from dano.cli.identifying._arguments import Identify
 from dano.cli.tracking import filming
 from dano.identification import (
@@ -301,15 +301,7 @@ def _noise(command: Identify) -> dict[str, float] | None:
 
 def _options(command: Identify, kept: Path | None) -> IdentifyOptions:
     """How the search runs; one of pixels is not kept."""
-    return IdentifyOptions(
-        window=command.window,
-        continuity=command.continuity,
-        huber=command.huber,
-        independent=command.independent,
-        starts=command.starts,
-        checkpoint=kept if command.video is None else None,
-        resume=command.resume,
-    )
+    return chosen(IdentifyOptions, command, checkpoint=kept if command.video is None else None)
 
 
 def _write_report(command: Identify, fit: Identification, seen: "Seen | None") -> None:

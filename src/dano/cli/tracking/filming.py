@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from dano import vision
+from dano.cli._outputs import chosen
 from dano.cli.tracking._arguments import Filming
 from dano.progress import Progress
 from dano.scene_file import asset_look
@@ -41,15 +42,7 @@ def filmed(filming: Filming, video: Path, rate: float | None, progress: Progress
 
 def options_of(filming: Filming) -> vision.TrackOptions:
     """How frames are compared with the object."""
-    return vision.TrackOptions(
-        masks=filming.mask_source,
-        loss=filming.loss,
-        rays=filming.rays,
-        shutter=filming.shutter,
-        readout=filming.readout,
-        table=filming.table,
-        seed=filming.seed,
-    )
+    return chosen(vision.TrackOptions, filming, masks=filming.mask_source)
 
 
 def focal_of(numbers: tuple[float, ...]) -> float | tuple[float, float] | None:

@@ -94,24 +94,19 @@ class Smoothed(NamedTuple):
 
 
 class Scenery(NamedTuple):
-    """What is known of a motion beside the frames.
+    """What is known of a motion beside the frames."""
 
-    Attributes:
-        solid: The object.
-        still: Whether it moves between a frame and the next one, shape (T − 1,): True if it does not.
-        table: Height of a level table [m, W]; None: none is known.
-        eye: Where the camera is [m, W]; None: what frames say has no distance in common that may be wrong.
-        scale: Standard deviation of the share by which all frames see it too near or too far, because the
-            object is known too small or too large.
-        alike: How many of their standard deviations all frames may be off alike, because of what is wrong in
-            all of them, such as the object's own shadow beside it.
-    """
-
-    solid: Solid
+    solid: Solid  # The object
+    # Whether it moves between a frame and the next one, shape (T − 1,): True if it does not.
     still: Bool[np.ndarray, " T_minus_1"]
-    table: float | None = None
+    table: float | None = None  # Height of a level table [m, W]; None: none is known
+    # Where the camera is [m, W]; None: what frames say has no distance in common that may be wrong.
     eye: Float[np.ndarray, "3"] | None = None
+    # Standard deviation of the share by which all frames see it too near or too far, because the object is
+    # known too small or too large.
     scale: float = 0.0
+    # How many of their standard deviations all frames may be off alike, because of what is wrong in all of
+    # them, such as the object's own shadow beside it.
     alike: float = 0.0
 
 

@@ -25,21 +25,13 @@ class Face(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """What lies and slides (see `solid_of`).
+    """What lies and slides (see `solid_of`)."""
 
-    Attributes:
-        size: Longest side of its box [m].
-        middle: Point that motions are told of [m, F].
-        com: Centre of mass [m, F].
-        corners: Of its convex hull [m, F].
-        faces: On which it can lie.
-    """
-
-    size: float
-    middle: Float[np.ndarray, "3"]
-    com: Float[np.ndarray, "3"]
-    corners: Float[np.ndarray, "n 3"]
-    faces: tuple[Face, ...]
+    size: float  # Longest side of its box [m]
+    middle: Float[np.ndarray, "3"]  # Point that motions are told of [m, F]
+    com: Float[np.ndarray, "3"]  # Centre of mass [m, F]
+    corners: Float[np.ndarray, "n 3"]  # Of its convex hull [m, F]
+    faces: tuple[Face, ...]  # On which it can lie
 
 
 def solid_of(points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]) -> Solid:
