@@ -67,7 +67,8 @@ def chosen(options: type[Options], command: Any, **given: Any) -> Options:
         command: The command, or a group of its options.
         **given: Those that are called or written otherwise.
     """
-    names = {field.name for field in dataclasses.fields(options)} & vars(command).keys()
+    kind: Any = options
+    names = {field.name for field in dataclasses.fields(kind)} & vars(command).keys()
     return options(**{name: getattr(command, name) for name in names} | given)
 
 
