@@ -11,7 +11,7 @@ from dano import vision
 from dano.archive import write_json
 from dano.cli._arguments import CheckPhotographs, Poses, Train
 from dano.cli._console import numbers, Progress, put, put_json, say
-from dano.cli._outputs import check_distinct, check_output, chosen, missing_for_pictures
+from dano.cli._outputs import check_distinct, check_output, chosen, picture_of
 from dano.cli.tracking.filming import focal_of
 from dano.fields import save_field
 from dano.learning import LearnedObject, train_object
@@ -110,15 +110,7 @@ def _print_poses(found: vision.EstimatedPoses) -> None:
 
 def data(command: CheckPhotographs) -> None:
     """See `dano data --help`."""
-    png = command.png
-    picture = None if command.no_png else png or Path(f"{command.images.resolve().stem}.png")
-    if picture is not None:
-        check_output(picture, suffix=".png")
-        if missing := missing_for_pictures(video=False):
-            if png is not None:
-                raise ImportError(missing)
-            say(f"warning: not drawn, {missing}")
-            picture = None
+    picture = picture_of(command, Path(f"{command.images.resolve().stem}.png"))
     _, report = look(
         command.images, command.network, picture, downscale=command.downscale, table=command.table
     )

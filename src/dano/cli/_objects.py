@@ -17,8 +17,8 @@ import numpy as np
 from dano import exchange, fields, objects, robots, scene_file
 from dano.building import BuildOptions
 from dano.cli._arguments import BuildObject, Export, Import, Inspect
-from dano.cli._console import numbers, Progress, put, put_json, say
-from dano.cli._outputs import check_output, missing_for_pictures
+from dano.cli._console import numbers, Progress, put, put_json
+from dano.cli._outputs import check_output, picture_of
 from dano.contact import ContactParams
 from dano.maths import Pose
 
@@ -273,14 +273,7 @@ def inspect(command: Inspect) -> None:
         if png is not None:
             raise ValueError(f"--png draws neural objects only, got the robot {path}")
         return _inspect_robot(path, as_json=command.json)
-    picture = None if command.no_png else png or path.with_suffix(".png")
-    if picture is not None:
-        check_output(picture, path, suffix=".png")
-        if missing := missing_for_pictures(video=False):
-            if png is not None:
-                raise ImportError(missing)
-            say(f"warning: not drawn, {missing}")
-            picture = None
+    picture = picture_of(command, path.with_suffix(".png"), path)
     progress = Progress()
     made = scene_file.load_object(path, progress=progress)
     progress.close()

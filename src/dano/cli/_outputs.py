@@ -17,6 +17,7 @@ from dano.cli._arguments import (
     Train,
     UNNAMED,
 )
+from dano.cli._console import say
 from dano.cli.tracking import Track
 from dano.extras import is_installed
 
@@ -154,3 +155,22 @@ def missing_for_pictures(*, video: bool) -> str | None:
     if missing := [name for name in packages if not is_installed(name)]:
         return f"pictures need {', '.join(missing)}: pip install 'dano[view]'"
     return None
+
+
+def picture_of(command: Any, usual: Path, *inputs: Path) -> Path | None:
+    """Where a command with `--png` and `--no-png` draws; None if it does not, or cannot and need not.
+
+    Raises:
+        ValueError: If the picture cannot be written.
+        ImportError: If it was asked for, and what draws it is not installed.
+    """
+    if command.no_png:
+        return None
+    picture = command.png or usual
+    check_output(picture, *inputs, suffix=".png")
+    if missing := missing_for_pictures(video=False):
+        if command.png is not None:
+            raise ImportError(missing)
+        say(f"warning: not drawn, {missing}")
+        return None
+    return picture

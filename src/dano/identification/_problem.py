@@ -192,19 +192,13 @@ class Problem:
             raise ValueError(
                 f"options.independent must be one label for each of {motions} motions, got {len(independent)}"
             )
-        count, least = len(np.unique(self._labels(independent))), len(self.space.start) + 2
+        count, least = len(np.unique(_labels(self, independent))), len(self.space.start) + 2
         if count < least:
             what = independent if isinstance(independent, str) else "labels"
             raise ValueError(
                 f"options.independent needs at least {least} {what}, two more than there are parameters, got"
                 f" {count}"
             )
-
-    def _labels(self, independent: str | Sequence[str]) -> np.ndarray:
-        """Of each window, what it shares errors with."""
-        if independent == "windows":
-            return np.arange(len(self.plan.rows))
-        return self.plan.owner if independent == "motions" else np.array(independent)[self.plan.owner]
 
     def begin_near(self, after: Identification) -> None:
         """Begin where an earlier fit left what it estimated of the windows' states, if this one does too."""
@@ -277,7 +271,7 @@ class Problem:
 
     def groups(self, found: Linearized, independent: str | Sequence[str]) -> Groups:
         """What each independent group of a simulation says of the parameters; see `IdentifyOptions`."""
-        labels = self._labels(independent)
+        labels = _labels(self, independent)
         arrays = [np.asarray(v, float) for v in found[:5]]
         parts = []
         for label in np.unique(labels):
@@ -326,7 +320,7 @@ class Problem:
         if starts is None:
             if self._near or not bounded or len(lower) > _SCANNED:
                 return [self.space.start]
-            tried = [self.space.start, *self._spread(_SCANS)]
+            tried = [self.space.start, *_spread(self, _SCANS)]
             # The program of the search itself: another one takes longer to compile than this.
             found = [self.linearize(x, self.plan.start).loss for x in tried]
             return [tried[int(np.argmin(np.where(np.isfinite(found), found, np.inf)))]]
@@ -334,17 +328,10 @@ class Problem:
             return [self.space.start]
         if not bounded:
             raise ValueError("options.starts > 1 needs finite bounds on every parameter")
-        tried = self._spread(_LOOKS * (starts - 1))
+        tried = _spread(self, _LOOKS * (starts - 1))
         found = np.array([self.loss(x, self.plan.start) for x in tried])
         order = np.argsort(np.where(np.isfinite(found), found, np.inf))
         return [self.space.start] + [tried[i] for i in order[: starts - 1]]
-
-    def _spread(self, count: int) -> np.ndarray:
-        """So many points all over the bounds."""
-        from scipy.stats import qmc
-
-        unit = qmc.Sobol(len(self.space.start), seed=self.seed).random(1 << (count - 1).bit_length())[:count]
-        return self.space.lower + unit * (self.space.upper - self.space.lower)
 
     def search(
         self,
@@ -488,7 +475,7 @@ class Problem:
         other = minimise(solution.x, _where(windows, begin, solution.blocks), held=held)
         if other.stop is Stop.INTERRUPTED:
             return solution._replace(stop=Stop.INTERRUPTED), False
-        here, there = self._by_motion(found), self._by_motion(self.simulate(solution.x, other.blocks))
+        here, there = _by_motion(self, found), _by_motion(self, self.simulate(solution.x, other.blocks))
         better = there < here - _BETTER
         if not better.any():
             return solution, False
@@ -508,8 +495,26 @@ class Problem:
         worse = mean > _POOR * np.median(mean) if len(mean) > 2 else np.ones(len(mean), bool)
         return worse & (losses > _BETTER)
 
-    def _by_motion(self, found: Linearized) -> np.ndarray:
-        return by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
+
+def _labels(problem: Problem, independent: str | Sequence[str]) -> np.ndarray:
+    """Of each window, what it shares errors with."""
+    if independent == "windows":
+        return np.arange(len(problem.plan.rows))
+    return problem.plan.owner if independent == "motions" else np.array(independent)[problem.plan.owner]
+
+
+def _spread(problem: Problem, count: int) -> np.ndarray:
+    """So many points all over the bounds."""
+    from scipy.stats import qmc
+
+    unit = qmc.Sobol(len(problem.space.start), seed=problem.seed).random(1 << (count - 1).bit_length())[
+        :count
+    ]
+    return problem.space.lower + unit * (problem.space.upper - problem.space.lower)
+
+
+def _by_motion(problem: Problem, found: Linearized) -> np.ndarray:
+    return by_owner(problem.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
 
 
 def _following(start: State) -> State:

@@ -15,7 +15,7 @@ from dano.fields import AbstractField, AbstractShape, bake, GridField, SignedDis
 from dano.objects import node_values
 from dano.report._stage import round_below
 from dano.report.viewing._drawn import add_coloured, BodyMesh, shape_mesh, vertex_colours
-from dano.report.viewing._serving import add_ground, add_note, open_on, serve, Viewer, write_file
+from dano.report.viewing._serving import add_ground, open_on, serve, Viewer, write_shown
 from dano.vision import checked_colour, LearnedField, PALETTE, usual_level
 
 _NODES = 96
@@ -81,12 +81,7 @@ def write_field_view(
     """
     _check(field, level)
 
-    def fill(server: Any) -> str:
-        shown = _ShownField(server, field, level)
-        add_note(server, [shown.said, shown.ground.said], shown.ground)
-        return shown.opening.in_page(server.get_scene_serializer().as_html())
-
-    write_file(path, fill)
+    write_shown(path, lambda server: _ShownField(server, field, level))
 
 
 def _check(field: AbstractField, level: float | None) -> None:

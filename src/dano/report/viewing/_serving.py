@@ -97,11 +97,6 @@ def _add_axes(scene: Any, at: np.ndarray, length: float) -> Float[np.ndarray, "3
     return tips
 
 
-def add_note(server: Any, lines: list[str], ground: Ground) -> None:
-    """Text before the grid, for pages without a panel."""
-    server.scene.add_label("/note", "\n".join(lines), position=ground.front, anchor="top-center")
-
-
 def _length(value: float, unit: str) -> str:
     if abs(value) < 1e-9:
         return "0"
@@ -311,6 +306,26 @@ def write_file(path: str | os.PathLike[str], fill: Callable[[Any], str]) -> None
         _quietly(server.stop)
     with replacing(target) as file:
         file.write(page.encode())
+
+
+def write_shown(path: str | os.PathLike[str], show: Callable[[Any], Any]) -> None:
+    """Write a page without a panel as one file; its text stands before the grid.
+
+    Args:
+        path: Where to.
+        show: Fills a server; what it gives has `said`, `ground` and `opening`.
+
+    Raises:
+        ValueError: See `write_file`.
+    """
+
+    def fill(server: Any) -> str:
+        shown = show(server)
+        note, place = "\n".join([shown.said, shown.ground.said]), shown.ground.front
+        server.scene.add_label("/note", note, position=place, anchor="top-center")
+        return shown.opening.in_page(server.get_scene_serializer().as_html())
+
+    write_file(path, fill)
 
 
 def _opened(**options: Any) -> Any:
