@@ -222,7 +222,24 @@ def compare(
     begin = time.perf_counter()
     own = Own(thing, TIMESTEP)
     _measured(bench, own, _own_row(bench), [], _surface(thing), rows, scenery, begin)
-    jobs = [(level, cleaned) for level in chosen for cleaned in (False, True)]
+    _measure_meshes(bench, grid, chosen, best, decomposed, say, rows, scenery)
+    say("done", 1.0)
+    reference = "the neural object" if truth is None else "the truth"
+    return Comparison(rows, scenery, reference, bench.solid.size, chosen, best, drops, missing)
+
+
+def _measure_meshes(
+    bench: _Bench,
+    grid: Grid,
+    levels: Sequence[float],
+    best: float,
+    decomposed: bool,
+    say: Callable[[str, float], object],
+    rows: list[Row],
+    scenery: list[Scenery],
+) -> None:
+    """Measure hulls of surfaces at all levels; of the best one its distance and its convex pieces, too."""
+    jobs = [(level, cleaned) for level in levels for cleaned in (False, True)]
     for i, (level, cleaned) in enumerate(jobs):
         say(f"surface at {level:.3g}", 0.1 + 0.4 * i / len(jobs))
         mesh = level_mesh(grid, level, cleaned=cleaned)
@@ -241,9 +258,6 @@ def compare(
         engines = (MuJoCo, PyBullet) if has_pybullet() else (MuJoCo,)
         for engine in engines:
             _mesh_row(bench, mesh, "best surface: CoACD", lambda _: pieces, engine, rows, scenery)
-    say("done", 1.0)
-    reference = "the neural object" if truth is None else "the truth"
-    return Comparison(rows, scenery, reference, bench.solid.size, chosen, best, drops, missing)
 
 
 def _missing(decomposed: bool) -> list[str]:

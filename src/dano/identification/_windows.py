@@ -222,10 +222,7 @@ def plan_windows(
         full = _on_all_bodies(scene, motion, what)
         pieces += _cut(scene, motion, full, state, control, number, window, smoothing, what)
     _report_impacts(scene, pieces, initial)
-    moving = [i for i, body in enumerate(scene.bodies) if not body.fixed]
-    seen = [i for i in moving if any(scene.names[i] in motion.names for motion in motions)]
-    if not seen:
-        raise ValueError(f"observed must hold a body that moves, got only fixed ones of {list(scene.names)}")
+    seen = _observed(scene, motions)
     dtype = scene.timestep.dtype
     observed, joints, weights = _weighed(scene.layout, pieces, seen, noise, initial, dtype)
     sizes = {key: np.full(len(scene.bodies), 3) for key in QUANTITIES} | {"q": joint_widths(scene.layout)}
@@ -269,6 +266,19 @@ def plan_windows(
     }
     rows = [piece["rows"] for piece in pieces]
     return Plan(windows, State(**start), n_steps, owner, rows, tuple(seen), tuple(weights), n_data)
+
+
+def _observed(scene: Scene, motions: Sequence[Motion]) -> list[int]:
+    """Bodies that move and are in a motion.
+
+    Raises:
+        ValueError: If there are none.
+    """
+    moving = [i for i, body in enumerate(scene.bodies) if not body.fixed]
+    seen = [i for i in moving if any(scene.names[i] in motion.names for motion in motions)]
+    if not seen:
+        raise ValueError(f"observed must hold a body that moves, got only fixed ones of {list(scene.names)}")
+    return seen
 
 
 def _stacked(values: list[np.ndarray], fill: float = 0.0) -> np.ndarray:

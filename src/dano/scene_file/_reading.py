@@ -305,15 +305,9 @@ def parse_scene(
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path} must be a TOML scene file: {error}") from error
     top = Table(str(path), data, _TOP)
-    asked = None if timestep is None else checked_number("timestep", timestep, above=0, unit="s")
-    h = top.number("timestep", 0.01) if asked is None else asked
-    if not (math.isfinite(h) and h > 0):
-        raise ValueError(f"{path}: timestep must be finite and > 0 s, got {h}")
+    h, steps = _time(top, path, timestep, n_steps)
     if "camera" in top:
         top.word("camera")
-    steps = _steps(top, h) if n_steps is None else n_steps
-    if steps < 1:
-        raise ValueError(f"{path}: n_steps must be ≥ 1, got {steps}")
     tables = top.tables("bodies")
     robots = read_robots(top, path.parent)
     usual = None
@@ -351,18 +345,38 @@ def parse_scene(
         if loops:
             # Coordinates that the file gives stay as they are.
             state = close_loops(scene, state, [name for name, given in start.items() if "q" in given])
-    objects = {
-        row["name"]: row["asset"] if "asset" in row else _source(path.parent, row["object"])
-        for row in tables
-        if "asset" in row or "object" in row
-    }
     schedule = read_schedule(top, scene)
-    made = SceneFile(scene, state, int(steps), schedule, path, text, objects, default_law)
+    made = SceneFile(scene, state, int(steps), schedule, path, text, _objects(tables, path), default_law)
     asked = top.number("duration") if n_steps is None and "duration" in top else None
     say_doubts(
         [*scene.doubts(state, start), *file_doubts(scene, state, schedule, int(steps), asked)], stacklevel=3
     )
     return made
+
+
+def _objects(tables: Sequence[dict[str, Any]], path: Path) -> dict[str, str | Path]:
+    """What neural objects are made of, by the names of their bodies."""
+    return {
+        row["name"]: row["asset"] if "asset" in row else _source(path.parent, row["object"])
+        for row in tables
+        if "asset" in row or "object" in row
+    }
+
+
+def _time(top: Table, path: Path, timestep: float | None, n_steps: int | None) -> tuple[float, int | float]:
+    """The step [s], and how many there are.
+
+    Raises:
+        ValueError: If one is out of range.
+    """
+    asked = None if timestep is None else checked_number("timestep", timestep, above=0, unit="s")
+    h = top.number("timestep", 0.01) if asked is None else asked
+    if not (math.isfinite(h) and h > 0):
+        raise ValueError(f"{path}: timestep must be finite and > 0 s, got {h}")
+    steps = _steps(top, h) if n_steps is None else n_steps
+    if steps < 1:
+        raise ValueError(f"{path}: n_steps must be ≥ 1, got {steps}")
+    return h, steps
 
 
 def _steps(top: Table, timestep: float) -> int | float:
