@@ -65,3 +65,10 @@ def test_results_are_arrays_of_their_own():
     same = one_program(lambda x: x)(x)
     x[0] = 1
     assert same[0] == 0
+
+
+def test_is_the_function_itself_where_arguments_have_no_hash():
+    class Odd:
+        __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    assert one_program(lambda x, odd: (x + 1, odd))(jnp.ones(2), odd := Odd())[1] is odd

@@ -29,10 +29,15 @@ def one_program(function: Function) -> Function:
 
     @functools.wraps(function)
     def call(*args, **kwargs):
-        leaves = jax.tree.leaves((args, kwargs))
+        leaves, tree = jax.tree.flatten((args, kwargs))
+        # For JAX 2 and 2.0 are one constant.
+        kinds = tuple((type(leaf), leaf) for leaf in leaves if not eqx.is_array(leaf))
+        try:
+            hash((tree, kinds))
+        except TypeError:  # something among the arguments cannot be told from another
+            return function(*args, **kwargs)
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return function(*args, **kwargs)
-        # For JAX 2 and 2.0 are one constant.
-        return compiled(tuple(type(leaf) for leaf in leaves if not eqx.is_array(leaf)), args, kwargs)
+        return compiled(kinds, args, kwargs)
 
     return call  # pyright: ignore[reportReturnType]
