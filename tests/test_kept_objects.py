@@ -19,7 +19,7 @@ from dano import caches
 from dano.building import BuildOptions
 from dano.fields import companion_files, GridField, save_field
 from dano.objects import NeuralObject
-from dano.scene_file import _kept, _objects, load_object, object_of_file, parse_scene
+from dano.scene_file import _objects, load_object, object_of_file, parse_scene
 
 OPTIONS = BuildOptions(samples=200, resolution=16, mass=0.2)
 QUICK = BuildOptions(samples=100, resolution=12, mass_scale=1000.0)
@@ -36,7 +36,7 @@ def cache(tmp_path, monkeypatch) -> Iterator[Path]:
 
 
 def forget(monkeypatch):
-    monkeypatch.setattr(_kept, "_built", {})
+    monkeypatch.setattr(_objects, "_kept_or_built", {})
     monkeypatch.setattr(_objects, "_said", set())
 
 

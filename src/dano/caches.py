@@ -44,7 +44,7 @@ _ABANDONED = 3600.0
 """Seconds after which a file that was not renamed is what an interrupted process left."""
 
 
-class Entry(NamedTuple):
+class CacheEntry(NamedTuple):
     """Something that is kept."""
 
     paths: tuple[Path, ...]  # Its files or folders
@@ -194,7 +194,7 @@ def keep(kind: str, name: str, write: Callable[[Path], object]) -> Path | None:
     return folder / name
 
 
-def contents(kinds: Sequence[str] = tuple(KINDS)) -> dict[str, list[Entry]]:
+def contents(kinds: Sequence[str] = tuple(KINDS)) -> dict[str, list[CacheEntry]]:
     """What is kept, by kind, what was used last first; nothing is made."""
     folder = cache_place()
     if folder is None:
@@ -204,17 +204,17 @@ def contents(kinds: Sequence[str] = tuple(KINDS)) -> dict[str, list[Entry]]:
     }
 
 
-def clear(kinds: Sequence[str] = tuple(KINDS)) -> list[Entry]:
+def clear(kinds: Sequence[str] = tuple(KINDS)) -> list[CacheEntry]:
     """Remove what is kept; what was removed."""
     return _limit(kinds, 0)
 
 
-def limit(size: int, kinds: Sequence[str] = tuple(KINDS)) -> list[Entry]:
+def limit(size: int, kinds: Sequence[str] = tuple(KINDS)) -> list[CacheEntry]:
     """Remove what was not used for longest until at most so much is left [bytes]; what was removed."""
     return _limit(kinds, size)
 
 
-def _limit(kinds: Sequence[str], size: int) -> list[Entry]:
+def _limit(kinds: Sequence[str], size: int) -> list[CacheEntry]:
     entries = [entry for kind in contents(kinds).values() for entry in kind]
     excess, removed = sum(entry.size for entry in entries) - size, []
     for entry in sorted(entries, key=lambda entry: entry.used):
@@ -230,7 +230,7 @@ def _limit(kinds: Sequence[str], size: int) -> list[Entry]:
     return removed
 
 
-def _entries(folder: Path) -> list[Entry]:
+def _entries(folder: Path) -> list[CacheEntry]:
     """What lies in the folder of a kind: files, those of one stem together, and what compilers keep."""
     found: list[list[Path]] = []
     together: dict[str, list[Path]] = {}
@@ -254,7 +254,7 @@ def _tidy(part: Path) -> None:
         pass
 
 
-def _entry(paths: Sequence[Path]) -> Entry | None:
+def _entry(paths: Sequence[Path]) -> CacheEntry | None:
     """Files and folders with their size; None if they are gone meanwhile."""
     size, used = 0, 0.0
     try:
@@ -266,4 +266,4 @@ def _entry(paths: Sequence[Path]) -> Entry | None:
                     size, used = size + state.st_size, max(used, state.st_mtime, state.st_atime)
     except OSError:
         return None
-    return Entry(tuple(paths), size, used)
+    return CacheEntry(tuple(paths), size, used)

@@ -275,6 +275,23 @@ def even_directions(count: int, lowest: float = -1.0) -> Float[np.ndarray, "n 3"
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
+def rigidly_joined(
+    masses: Float[np.ndarray, " n"], centres: Float[np.ndarray, "n 3"], inertias: Float[np.ndarray, "n 3 3"]
+) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Mass, centre of mass and inertia about it of bodies that are one (parallel-axis theorem).
+
+    Args:
+        masses: Theirs [kg].
+        centres: Their centres of mass [m], in one frame.
+        inertias: Their inertias about these [kg m²], in the same axes.
+    """
+    mass = float(np.sum(masses))
+    com = masses @ centres / mass
+    arms = centres - com
+    away = np.sum(arms**2, axis=1)[:, None, None] * np.eye(3) - arms[:, :, None] * arms[:, None, :]
+    return mass, com, np.sum(inertias + masses[:, None, None] * away, axis=0)
+
+
 # GPUs multiply matrices of 32-bit numbers with three digits (TF32) where nothing else is asked for: good for
 # networks, but points would be off by a thousandth of their coordinates. Elsewhere it changes nothing.
 _ALL_DIGITS = jax.lax.Precision.HIGHEST

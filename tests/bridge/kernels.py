@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from dano.mujoco._search import filled, Known, part_of_geom
-from dano.mujoco._solids import geom_of
+from dano.mujoco._search import BridgeModel, filled, part_of_geom
+from dano.mujoco._things import geom_of
 from dano.native import Features, instance
 
 FEATURES = Features(KINDS=frozenset(range(7)), DEGREES=frozenset({2}), UNIONS=False)
@@ -61,7 +61,7 @@ def _shown(tables, model):
 
 def distances(model, part, points):
     """Signed distances [m] of a part, their gradients, and lower bounds, at points of its frame (n, 3)."""
-    known = Known([part], np.zeros((0, 2), np.int32), model.geom_size)
+    known = BridgeModel([part], np.zeros((0, 2), np.int32), model.geom_size)
     tables, ask, _ = _kernels()
     x = wp.array(np.ascontiguousarray(points, np.float64), dtype=tables.vec3, device="cpu")
     found = wp.zeros(len(points), dtype=tables.vec4, device="cpu")

@@ -6,7 +6,7 @@ import pytest
 
 import dano
 from dano.mujoco import Bridge
-from dano.mujoco._faces import faces_of
+from dano.mujoco._things import faces_of
 
 HALF = np.array([0.05, 0.02, 0.02])
 

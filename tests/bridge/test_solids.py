@@ -9,7 +9,7 @@ from bridge.supports import SUPPORTS, TYPES
 
 from dano import Box, Capsule, Cylinder, Sphere
 from dano.fields import Ellipsoid
-from dano.mujoco._surfaces import surface_of
+from dano.mujoco._things import surface_of
 
 HALF = np.array([0.3, 0.2, 0.1])
 CASES = {

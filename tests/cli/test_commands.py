@@ -18,7 +18,7 @@ import dano
 from dano.cli import _scenes
 from dano.cli._outputs import run_files
 from dano.fields import GridField, load_field, save_field
-from dano.scene_file import _objects as shipped, _pieces, load_run, load_scene
+from dano.scene_file import _objects as shipped, _runs, load_run, load_scene
 from dano.vision import read_film
 
 
@@ -351,7 +351,7 @@ def test_unconverged_steps_are_said(run, scene, tmp_path, monkeypatch):
             piece.times, piece.states, piece.residuals + 1, piece.iterations, ~piece.converged, piece.names
         )
 
-    monkeypatch.setattr(_pieces, "simulate", failing)
+    monkeypatch.setattr(_runs, "simulate", failing)
     answer = run("simulate", scene, "-o", tmp_path / "run.npz", "--json")
     assert answer.code == 0
     assert json.loads(answer.out)["unconverged_steps"] == 400
@@ -362,7 +362,7 @@ def test_interrupt_leaves_nothing(run, scene, tmp_path, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_pieces, "simulate", interrupted)
+    monkeypatch.setattr(_runs, "simulate", interrupted)
     before = sorted(tmp_path.iterdir())
     answer = run("simulate", scene, "-o", tmp_path / "run.npz")
     assert answer.code == 130
@@ -377,12 +377,12 @@ def test_an_interrupt_that_was_swallowed_still_ends_the_command(run, scene, tmp_
             signal.raise_signal(signal.SIGINT)
         return dano.simulate(*given, **options)
 
-    monkeypatch.setattr(_pieces, "simulate", swallowing)
+    monkeypatch.setattr(_runs, "simulate", swallowing)
     answer = run("simulate", scene, "-o", tmp_path / "run.npz")
     assert (answer.code, answer.err) == (130, "dano: interrupted\n")
     assert not (tmp_path / "run.npz").exists()
     # The next command is none the wiser.
-    monkeypatch.setattr(_pieces, "simulate", dano.simulate)
+    monkeypatch.setattr(_runs, "simulate", dano.simulate)
     assert run("simulate", scene, "-o", tmp_path / "run.npz", "--steps", 400).code == 0
 
 

@@ -5,7 +5,7 @@ import pytest
 
 import dano
 from dano.comparison import compare
-from dano.comparison._bodies import GRAVITY, Probes, Rigid, Start
+from dano.comparison._bodies import Drop, GRAVITY, Probes, Rigid
 from dano.comparison._mujoco import MuJoCo
 from dano.comparison._own import Own
 from dano.comparison._pybullet import PyBullet
@@ -41,7 +41,7 @@ def engine(request, thing):
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_box_falls_freely_and_comes_to_rest(engine):
     q = np.array([0.9, 0.3, -0.2, 0.1])
-    start = Start(np.array([0.0, 0.0, 0.2]), q / np.linalg.norm(q), np.array([1.0, 2.0, -0.5]))
+    start = Drop(np.array([0.0, 0.0, 0.2]), q / np.linalg.norm(q), np.array([1.0, 2.0, -0.5]))
     path = engine.drop(start, 1000)
     com = path.of(CENTRE[None])[:, 0]
     t = TIMESTEP * np.arange(40)

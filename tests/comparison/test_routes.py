@@ -3,9 +3,17 @@
 import numpy as np
 import pytest
 
-from dano.comparison._bodies import Probes, together
-from dano.comparison._rest import nearest_rest, stable_directions
-from dano.comparison._routes import best_level, components, Grid, largest_component, level_mesh
+from dano.comparison._bodies import (
+    best_level,
+    components,
+    Grid,
+    largest_component,
+    level_mesh,
+    nearest_rest,
+    Probes,
+    stable_directions,
+    together,
+)
 from dano.exchange import convex_hull, enclosed, Triangles
 
 RADIUS = 0.3

@@ -11,8 +11,7 @@ from export.conftest import check_mass, QUICK, tensor
 import dano
 from dano.contact import ContactParams
 from dano.exchange import _export, export_object
-from dano.exchange._look import painted
-from dano.exchange._triangles import solid_triangles
+from dano.exchange._triangles import painted, solid_triangles
 from dano.exchange._urdf import roll_pitch_yaw
 from dano.maths import quat_to_matrix
 

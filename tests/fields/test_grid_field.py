@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage, optimize
 
 from dano.fields import GridField
-from dano.fields._spline import CHUNK
+from dano.fields._grid import CHUNK
 
 ORDERS = {"linear": 1, "quadratic": 2, "cubic": 3}
 kinds = pytest.mark.parametrize("kind", ORDERS)

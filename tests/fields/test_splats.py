@@ -13,7 +13,7 @@ from scipy.special import sph_harm_y
 
 import dano
 from dano.fields import load_field, read_splats, Splats
-from dano.fields.readers._gaussians import harmonics
+from dano.fields.readers._splats import harmonics
 from dano.maths import Pose
 from dano.objects import fill_hollows, node_values
 from dano.report import view_splats

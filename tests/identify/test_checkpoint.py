@@ -12,7 +12,7 @@ import pytest
 
 import dano
 from dano.archive import Pace
-from dano.identification._checkpoint import Checkpoint
+from dano.identification._checkpoint import SearchCheckpoint
 
 NOISE = {"position": 1e-4, "orientation": 2e-3}
 
@@ -72,7 +72,7 @@ def test_a_search_that_is_killed_again_and_again(case, tmp_path, monkeypatch):
     whole = dano.identify(scene, motion, parameters, options=options, **given)
     monkeypatch.setattr(Pace, "every", 0.0)
     monkeypatch.setattr(Pace, "share", 0)
-    write, written = Checkpoint._write, []
+    write, written = SearchCheckpoint._write, []
 
     def killed(self, *, now):
         write(self, now=now)
@@ -80,7 +80,7 @@ def test_a_search_that_is_killed_again_and_again(case, tmp_path, monkeypatch):
         if len(written) % 4 == 0:
             raise MemoryError  # stands for an end without any clearing up
 
-    monkeypatch.setattr(Checkpoint, "_write", killed)
+    monkeypatch.setattr(SearchCheckpoint, "_write", killed)
     ends, fit = 0, None
     while fit is None:
         try:

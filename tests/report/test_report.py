@@ -10,7 +10,7 @@ from vision.models import learned
 
 import dano
 from dano.report import (
-    _framing,
+    _stage,
     _video,
     CAMERAS,
     draw_object,
@@ -22,9 +22,7 @@ from dano.report import (
     VideoOptions,
 )
 from dano.report._object import with_error
-from dano.report._overlay import draw_label
-from dano.report._resample import frame_times, poses_at
-from dano.report._stage import stage
+from dano.report._stage import draw_label, frame_times, poses_at, stage
 from dano.scene_file import drop_scene, parse_scene
 from dano.vision import Camera, LearnedField
 
@@ -287,13 +285,13 @@ def test_moving_bodies_fill_a_third_of_the_height_and_stay_in_view(run: Run):
     # Ten times as far: a camera that stands still would show specks.
     position = 10 * np.asarray(trajectory.states.position)
     orientation = np.asarray(trajectory.states.orientation)
-    seen = _framing.seen_of(scene, drawn, position, orientation)
+    seen = _stage.seen_of(scene, drawn, position, orientation)
     moving = seen.moving
     fills, cameras = {}, []
     for how in CAMERAS:
-        cameras = _framing.cameras_for(seen, 0.01, (640, 400), how)
+        cameras = _stage.cameras_for(seen, 0.01, (640, 400), how)
         assert len(cameras) == n
-        fills[how] = _framing._least_fill(cameras, moving)
+        fills[how] = _stage._least_fill(cameras, moving)
         for camera, points in zip(cameras, moving, strict=True):
             x, y = camera.project(points)[:, :2].T
             assert 0 < x.min() and x.max() < 640 and 0 < y.min() and y.max() < 400
@@ -431,7 +429,7 @@ def test_numbers_have_as_many_digits_as_their_error_allows(value, error, text):
 
 
 def test_a_scale_is_a_round_length_below():
-    from dano.report._overlay import length_text, round_below
+    from dano.report._stage import length_text, round_below
 
     for x, below in ((0.37, 0.2), (0.5, 0.5), (9.9, 5.0), (1.0, 1.0), (0.0019, 0.001)):
         assert round_below(x) == pytest.approx(below)
@@ -439,7 +437,7 @@ def test_a_scale_is_a_round_length_below():
 
 
 def test_the_bar_is_as_long_as_what_it_stands_for():
-    from dano.report._overlay import draw_clock
+    from dano.report._stage import draw_clock
 
     camera = Camera((0, -2, 0), (0, 0, 0), width=640, height=400)
     grey = np.full((400, 640, 3), 200, np.uint8)

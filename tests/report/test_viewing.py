@@ -15,11 +15,17 @@ from vision.photographs import capture, CENTRE, SEMI_AXES
 import dano
 from dano.report import view, view_capture, view_field, write_capture_view, write_field_view, write_view
 from dano.report.viewing._capture import _camera_length
-from dano.report.viewing._drawn import Drawn, Shown
-from dano.report.viewing._field import Surface
-from dano.report.viewing._meshes import add_coloured, body_mesh, BodyMesh, shape_mesh, surface_mesh
-from dano.report.viewing._opening import open_on
-from dano.report.viewing._serving import serve
+from dano.report.viewing._drawn import (
+    add_coloured,
+    body_mesh,
+    BodyMesh,
+    Drawn,
+    shape_mesh,
+    Shown,
+    surface_mesh,
+)
+from dano.report.viewing._field import FieldSurface
+from dano.report.viewing._serving import open_on, serve
 from dano.scene_file import asset_look, load_asset
 from dano.vision import Camera, Capture, LearnedField, visual_hull
 
@@ -130,7 +136,7 @@ def test_the_surface_of_a_density_lies_where_it_has_the_level():
     pytest.importorskip("igl")
     x = np.stack(np.meshgrid(*(np.arange(41) - 20.0,) * 3, indexing="ij"), axis=-1)
     values = np.clip(18 - np.linalg.norm(x, axis=-1), 0, None)
-    surface = Surface(dano.GridField(values, (-0.2, -0.2, -0.2), 0.01, "linear"), 6.0)
+    surface = FieldSurface(dano.GridField(values, (-0.2, -0.2, -0.2), 0.01, "linear"), 6.0)
     assert surface.level == 6.0 and surface.levels is not None
     assert surface.levels[0] < 6.0 < surface.levels[1] < 18
     for level in (3.0, 6.0, 12.0):
@@ -142,7 +148,7 @@ def test_the_surface_of_a_density_lies_where_it_has_the_level():
 
 def test_a_density_that_reaches_its_bounds_is_closed_there():
     pytest.importorskip("igl")
-    mesh = Surface(dano.GridField(np.ones((9, 9, 9)), (0.0, 0.0, 0.0), 0.1, "linear"), None).mesh(0.5)
+    mesh = FieldSurface(dano.GridField(np.ones((9, 9, 9)), (0.0, 0.0, 0.0), 0.1, "linear"), None).mesh(0.5)
     assert mesh is not None
     # Half a cell outside the last node lies the level, between one and nothing.
     assert volume(mesh) == pytest.approx(0.9**3, rel=0.05)
@@ -152,7 +158,7 @@ def test_a_fine_grid_is_drawn_coarser():
     pytest.importorskip("igl")
     x = (np.arange(200) - 99.5) / 100
     values = np.clip(20 * (0.8 - np.sqrt(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2)), 0, 1)
-    mesh = Surface(dano.GridField(values, (-0.995, -0.995, -0.995), 0.01, "linear"), 0.5).mesh(0.5)
+    mesh = FieldSurface(dano.GridField(values, (-0.995, -0.995, -0.995), 0.01, "linear"), 0.5).mesh(0.5)
     assert mesh is not None
     # On all 200 nodes there would be 340,000.
     assert len(mesh.faces) < 150_000
@@ -163,7 +169,7 @@ def test_a_fine_grid_is_drawn_coarser():
 def test_a_learned_field_has_its_colours_at_every_level():
     pytest.importorskip("igl")
     field = LearnedField.from_model(learned(), 120.0)
-    surface = Surface(field, None)
+    surface = FieldSurface(field, None)
     assert surface.level == 0.5
     solid = field.solid.sdf_jet
     for level in (0.2, 0.5, 0.8):

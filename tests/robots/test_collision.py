@@ -114,14 +114,24 @@ COLLADA = """ <?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/1
 <asset><unit name="centimeter" meter="0.01"/><up_axis>Y_UP</up_axis></asset>
 <library_geometries><geometry id="g"><mesh>
 <source id="p"><float_array id="pa" count="15">0 0 0 10 0 0 10 10 0 0 10 0 99 99 99</float_array>
-<technique_common><accessor source="#pa" count="5" stride="3"/></technique_common></source>
+<technique_common><accessor source="#pa" count="5" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<source id="n"><float_array id="na" count="3">0 0 1</float_array>
+<technique_common><accessor source="#na" count="1" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
 <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
 <polylist count="1"><input semantic="VERTEX" source="#v" offset="0"/>
-<input semantic="NORMAL" source="#v" offset="1"/>
+<input semantic="NORMAL" source="#n" offset="1"/>
 <vcount>4</vcount><p>0 0 1 0 2 0 3 0</p></polylist></mesh></geometry></library_geometries>
 <library_visual_scenes><visual_scene id="s"><node><translate>100 0 0</translate><rotate>0 0 1 90</rotate>
 <node><matrix>2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</matrix><instance_geometry url="#g"/></node></node>
 </visual_scene></library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+EMPTY = COLLADA.replace("<vcount>4</vcount><p>0 0 1 0 2 0 3 0</p>", "<vcount></vcount><p></p>").replace(
+    'count="1"', 'count="0"'
+)
+BROKEN = COLLADA.replace("accessor", "excessor")
+MIRRORED = COLLADA.replace("<matrix>2", "<matrix>-2")
 
 
 def test_collada(tmp_path):
@@ -129,9 +139,16 @@ def test_collada(tmp_path):
     path = tmp_path / "tile.dae"
     path.write_text(COLLADA)
     vertices, faces = read_collada(path)
-    np.testing.assert_allclose(vertices, [[1, 0, 0], [1, 0.2, 0], [0.9, 0.2, 0], [0.9, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(vertices, [[1, 0, 0], [1, 0.2, 0], [0.9, 0.2, 0], [0.9, 0, 0]], atol=1e-7)
     assert faces.tolist() == [[0, 1, 2], [0, 2, 3]]
-    for text, message in (("<COLLADA", "broken XML"), ("<a/>", "got <a>"), ("<COLLADA/>", "got none")):
+    path.write_text(MIRRORED)
+    assert read_collada(path)[1].tolist() == [[2, 1, 0], [3, 2, 0]]
+    for text, message in (
+        ("<COLLADA", "cannot be read"),
+        ("<a/>", ""),
+        ("<COLLADA/>", ""),
+        (EMPTY, "got none"),
+    ):
         path.write_text(text)
         with pytest.raises(ValueError, match=f"must be a Collada file.*{message}"):
             read_collada(path)

@@ -324,7 +324,7 @@ def test_a_video_leaves_its_frames_or_nothing(tmp_path: Path):
 
 
 def test_an_upright_video_is_turned(tmp_path: Path):
-    from dano.vision.structure._video import _upright
+    from dano.vision.structure._photographs import _upright
 
     class Frame:
         rotation = 90

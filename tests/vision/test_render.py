@@ -9,7 +9,7 @@ from vision.models import Fog, learned
 from dano import Box, GridField, HalfSpace, Pose, Sphere
 from dano.fields import AbstractShape
 from dano.vision import Camera, Item, level_surface, PosedCamera, render
-from dano.vision.drawing._rays import CHUNK, Thing, Tracer, transmitted
+from dano.vision.drawing._rays import CHUNK, TracedItem, Tracer, transmitted
 from dano.vision.radiance._picture import picture
 
 EYE = np.eye(3, dtype=np.float32)
@@ -47,7 +47,7 @@ def test_rays_meet_a_box_where_the_slabs_do():
     near, far = np.sort(np.stack([(-half - o) / local, (half - o) / local]), axis=0)
     enter, leave = near.max(axis=1), far.min(axis=1)
     assert item.shape is not None
-    thing = Thing(item.shape, rotation, np.array([0.1, 0.2, 0.3]), *item.placed_ball, False)
+    thing = TracedItem(item.shape, rotation, np.array([0.1, 0.2, 0.3]), *item.placed_ball, False)
     numbers = {
         "light": (0.0, 0.0, 1.0),
         "focus": ZERO,
@@ -100,7 +100,7 @@ def test_rays_of_a_pixel_get_the_light_that_each_would_get_alone():
     shapes = [(Sphere(0.2), (0.0, 0.0, 0.35)), (Box((0.1, 0.1, 0.1)), (0.3, 0.1, 0.1))]
     items = [(shape, Item(shape, Pose(place))) for shape, place in shapes]
     things = [
-        Thing(shape, np.eye(3), np.asarray(item.pose.position), *item.placed_ball, False)
+        TracedItem(shape, np.eye(3), np.asarray(item.pose.position), *item.placed_ball, False)
         for shape, item in items
     ]
     camera = Camera((0.6, -1.5, 1.2), (0.1, 0.0, 0.15), width=160, height=120)

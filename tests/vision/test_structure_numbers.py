@@ -20,7 +20,7 @@ from dano.vision.structure._gauge import (
     world_frame,
 )
 from dano.vision.structure._markers import detect_markers, place_markers
-from dano.vision.structure._sharpness import blur
+from dano.vision.structure._photographs import blur
 from dano.vision.structure._similarity import fit_similarity, looked_at, pose_errors, Similarity
 from dano.vision.structure._triangulation import triangulate
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from dano.vision.radiance._trilinear import smooth_slope_at
 from dano.vision.radiance._volume import (
     by_halves,
     composite,
     density_alpha,
     importance_edges,
     section_weights,
+    smooth_slope_at,
     stratified_edges,
     surface_alpha,
     surface_interest,

@@ -3,7 +3,7 @@
 import math
 import time
 
-from dano.caches import cache_folder, clear, contents, Entry, KINDS, limit
+from dano.caches import cache_folder, CacheEntry, clear, contents, KINDS, limit
 from dano.cli._arguments import Cache
 from dano.cli._console import put, put_json
 from dano.memory import in_bytes
@@ -54,7 +54,7 @@ def _bytes(text: str) -> int:
     return int(number * 1024 ** _UNITS.get(unit, 0))
 
 
-def _line(entries: list[Entry]) -> str:
+def _line(entries: list[CacheEntry]) -> str:
     if not entries:
         return "nothing"
     size, days = sum(entry.size for entry in entries), _age(entries)
@@ -62,11 +62,11 @@ def _line(entries: list[Entry]) -> str:
     return f"{len(entries):>4}, {in_bytes(size)}, {ages}"
 
 
-def _age(entries: list[Entry]) -> float:
+def _age(entries: list[CacheEntry]) -> float:
     """Days since the oldest was used last."""
     return max(0.0, (time.time() - min(entry.used for entry in entries)) / _DAY)
 
 
-def _summary(entries: list[Entry]) -> dict[str, int | float]:
+def _summary(entries: list[CacheEntry]) -> dict[str, int | float]:
     days = _age(entries) if entries else 0.0
     return {"entries": len(entries), "bytes": sum(entry.size for entry in entries), "oldest_days": days}

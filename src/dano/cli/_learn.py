@@ -7,52 +7,24 @@ from typing import Any
 
 import numpy as np
 
+from dano import vision
 from dano.archive import write_json
-from dano.cli._arguments import Data, Poses, Train
+from dano.cli._arguments import CheckPhotographs, Poses, Train
 from dano.cli._console import numbers, Progress, put, put_json, say
-from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
+from dano.cli._outputs import check_distinct, check_output, chosen, picture_of
 from dano.cli.tracking.filming import focal_of
 from dano.fields import save_field
 from dano.learning import LearnedObject, train_object
 from dano.objects import NeuralObject
-from dano.vision import (
-    Capture,
-    estimate_poses,
-    EstimatedPoses,
-    KnownLength,
-    load_capture,
-    PoseOptions,
-    save_transforms,
-    Survey,
-    survey,
-    Trained,
-    TrainOptions,
-    with_masks,
-)
 
 
 def poses(command: Poses) -> None:
     """See `dano poses --help`."""
     check_output(command.output, command.images, suffix=".json")
-    options = PoseOptions(
-        focal=focal_of(command.focal),
-        centre=command.centre,
-        distortion=command.distortion,
-        lens=command.lens,
-        features_on=command.features_on,
-        features=command.features,
-        marker_size=command.marker_size,
-        marker_family=command.marker_family,
-        known_length=_known_length(command),
-        up=command.up,
-        frames=command.frames,
-        since=command.since,
-        until=command.until,
-        model=command.model,
-        seed=command.seed,
-    )
+    lens = {"focal": focal_of(command.focal), "known_length": _known_length(command)}
+    options = chosen(vision.PoseOptions, command, **lens)
     progress = Progress()
-    found = estimate_poses(
+    found = vision.estimate_poses(
         [command.images, *command.further] if command.further else command.images,
         options,
         masks=command.masks,
@@ -60,7 +32,7 @@ def poses(command: Poses) -> None:
         progress=progress,
     )
     progress.close()
-    save_transforms(found, command.output)
+    vision.save_transforms(found, command.output)
     if command.json:
         put_json({"file": str(command.output), **_describe_poses(found)})
         return
@@ -69,14 +41,14 @@ def poses(command: Poses) -> None:
     put(f"wrote {command.output}: next, `dano data {command.output}` and `dano train {command.output}`")
 
 
-def _known_length(command: Poses) -> KnownLength | None:
+def _known_length(command: Poses) -> vision.KnownLength | None:
     if (command.length is None) != (not command.ends):
         raise ValueError(
             "length and ends belong together: --length 0.2 --ends a.jpg:120,80:410,95 b.jpg:96,70:377,101"
         )
     if command.length is None:
         return None
-    return KnownLength(command.length, dict(_ends(text) for text in command.ends))
+    return vision.KnownLength(command.length, dict(_ends(text) for text in command.ends))
 
 
 def _ends(text: str) -> tuple[str, tuple[float, float, float, float]]:
@@ -89,7 +61,7 @@ def _ends(text: str) -> tuple[str, tuple[float, float, float, float]]:
     return name, (x1, y1, x2, y2)
 
 
-def _describe_poses(found: EstimatedPoses) -> dict[str, Any]:
+def _describe_poses(found: vision.EstimatedPoses) -> dict[str, Any]:
     """What was found, in numbers."""
     focal = sorted({round(float(p.camera.focal.mean()), 2) for p in found.pictures})
     return {
@@ -112,7 +84,7 @@ def _describe_poses(found: EstimatedPoses) -> dict[str, Any]:
     }
 
 
-def _print_poses(found: EstimatedPoses) -> None:
+def _print_poses(found: vision.EstimatedPoses) -> None:
     report = _describe_poses(found)
     put(f"registered          {report['registered']} of {report['pictures']} pictures")
     others = [str(n) for i, n in enumerate(found.models) if i != found.model]
@@ -136,17 +108,9 @@ def _print_poses(found: EstimatedPoses) -> None:
         say(f"warning: {text}")
 
 
-def data(command: Data) -> None:
+def data(command: CheckPhotographs) -> None:
     """See `dano data --help`."""
-    png = command.png
-    picture = None if command.no_png else png or Path(f"{command.images.resolve().stem}.png")
-    if picture is not None:
-        check_output(picture, suffix=".png")
-        if missing := missing_for_pictures(video=False):
-            if png is not None:
-                raise ImportError(missing)
-            say(f"warning: not drawn, {missing}")
-            picture = None
+    picture = picture_of(command, Path(f"{command.images.resolve().stem}.png"))
     _, report = look(
         command.images, command.network, picture, downscale=command.downscale, table=command.table
     )
@@ -163,7 +127,7 @@ def look(
     *,
     downscale: int = 1,
     table: float | None = None,
-) -> tuple[Capture, dict[str, Any]]:
+) -> tuple[vision.Capture, dict[str, Any]]:
     """Photographs with masks, given or made, and what they say of themselves in numbers.
 
     Args:
@@ -175,13 +139,13 @@ def look(
     """
     progress = Progress()
     progress("reading photographs", 0.0)
-    capture = load_capture(images, downscale=downscale)
+    capture = vision.load_capture(images, downscale=downscale)
     given = capture.has_masks
     if not given:
         progress("making masks", 0.2)
-        capture = with_masks(capture, network, table)
+        capture = vision.with_masks(capture, network, table)
     progress("visual hull", 0.4)
-    found = survey(capture, 64)
+    found = vision.survey(capture, 64)
     progress.close()
     report = describe(capture, found, masks_given=given)
     if picture is not None:
@@ -192,7 +156,7 @@ def look(
     return capture, report
 
 
-def describe(capture: Capture, found: Survey, *, masks_given: bool) -> dict[str, Any]:
+def describe(capture: vision.Capture, found: vision.Survey, *, masks_given: bool) -> dict[str, Any]:
     """A capture in numbers."""
     views = capture.split("train")
     inside = np.argwhere(found.hull < 0)
@@ -244,13 +208,7 @@ def print_data(report: dict[str, Any]) -> None:
 
 def train(command: Train) -> None:
     """See `dano train --help`."""
-    options = TrainOptions(
-        resolution=command.resolution,
-        iterations=command.iterations,
-        batch=command.batch,
-        seconds=command.seconds,
-        seed=command.seed,
-    )
+    options = chosen(vision.TrainOptions, command)
     outputs = _outputs(command.output)
     for path in outputs.values():
         check_output(path)
@@ -325,7 +283,9 @@ def _outputs(output: Path) -> dict[str, Path]:
     }
 
 
-def _summary(trained: Trained, made: NeuralObject, output: Path, *, masks_given: bool) -> dict[str, Any]:
+def _summary(
+    trained: vision.Trained, made: NeuralObject, output: Path, *, masks_given: bool
+) -> dict[str, Any]:
     main = trained.scores.get("test") or next(iter(trained.scores.values()))
     points = np.asarray(made.surface.points)
     return {

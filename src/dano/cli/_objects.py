@@ -1,7 +1,12 @@
-"""`dano build` and `dano inspect`."""
+"""`dano build` and `dano inspect`.
+
+`dano export`.
+`dano import`.
+"""
 
 import dataclasses
 import math
+import re
 import textwrap
 import warnings
 from pathlib import Path
@@ -9,34 +14,246 @@ from typing import Any
 
 import numpy as np
 
-from dano.cli._arguments import Build, Inspect
-from dano.cli._console import numbers, Progress, put, put_json, say
-from dano.cli._outputs import check_output, missing_for_pictures
-from dano.objects import Interior, NeuralObject
-from dano.robots import read_robot, robot_doubts, robot_tree
-from dano.scene_file import build_parts, load_object, materials_doubt, object_of_file, parts_of
+from dano import exchange, fields, objects, robots, scene_file
+from dano.building import BuildOptions
+from dano.cli._arguments import BuildObject, Export, Import, Inspect
+from dano.cli._console import numbers, Progress, put, put_json
+from dano.cli._outputs import check_output, picture_of
+from dano.contact import ContactParams
+from dano.maths import Pose
+
+
+def export(arguments: Export) -> None:
+    """See `dano export --help`."""
+    exchange.check_folder(arguments.output)
+    given = {"sliding_friction": arguments.friction, "restitution": arguments.restitution}
+    parameters = ContactParams(**{key: value for key, value in given.items() if value is not None})
+    made = scene_file.load_object(arguments.object)
+    name = arguments.name
+    if name is None:
+        word = re.sub(r"\W", "_", arguments.object.stem, flags=re.ASCII)
+        name = word if re.match(r"[A-Za-z]", word) else f"object_{word}"
+    progress = Progress()
+    written = exchange.export_object(
+        made,
+        arguments.output,
+        name=name,
+        look=scene_file.object_look(arguments.object),
+        contact=parameters,
+        progress=progress,
+        to=arguments.to,
+        collision=arguments.collision,
+        concavity=arguments.concavity,
+        max_pieces=arguments.max_pieces,
+        resolution=arguments.resolution,
+        texture_size=arguments.texture_size,
+    )
+    progress.close()
+    if arguments.json:
+        put_json({**written._asdict(), "folder": str(written.folder)})
+        return
+    put(f"wrote {_what(written)}")
+    put(f"  {', '.join(file for file in written.files if '/' not in file)}")
+    for note in written.notes:
+        put(f"- {note}")
+
+
+def _what(written: exchange.Exported) -> str:
+    pieces = (
+        "its convex hull" if written.collision == "hull" else f"{written.pieces} convex piece(s) by CoACD"
+    )
+    colours = "with its learned colours" if written.textured else "in one colour: none were learned"
+    return f"{written.folder}: {written.triangles} triangles {colours}, and {pieces} for contact"
+
+
+_WATER = 1000.0
+"""Density [kg/m³] of what nobody weighed."""
+_USUAL = (1e-3, 20.0)
+"""Widths [m] of a field beyond which its file is rather in other units than so small or large."""
+
+
+def import_field(command: Import) -> None:
+    """See `dano import --help`."""
+    file, output, resolution = command.file, command.output, command.resolution
+    splats = _kind(file) == "splats"
+    _check_folder_options(command, splats)
+    if not command.to:
+        check_output(output, Path(file), suffix=".npz")
+    if resolution is not None and not 4 <= resolution <= 1024:
+        raise ValueError(f"resolution must lie between 4 and 1024 nodes, got {resolution}")
+    moved = np.any(command.position) or command.orientation != (1.0, 0.0, 0.0, 0.0)
+    pose = Pose(command.position, command.orientation) if moved else None
+    progress = Progress()
+    progress("reading the field", 0.0)
+    box = None if command.crop is None else np.reshape(command.crop, (2, 3))
+    sampled = {}
+    nodes = 128 if resolution is None else resolution
+    if _kind(file) == "mesh":
+        sampled = {} if resolution is None else {"resolution": resolution}
+    elif splats:
+        # Gaussians thinner than the distance between nodes would fall between them: a shell full of pores.
+        with warnings.catch_warnings():
+            # Said when it is read below.
+            warnings.simplefilter("ignore", UserWarning)
+            lower, upper = np.asarray(fields.load_field(file, crop=box, **_of_format(command)).bounds)
+        sampled = {"min_width": 0.5 * float(np.max(upper - lower)) / (nodes - 1)}
+    unit = {"scale": command.scale, "units": command.units}
+    field = fields.load_field(file, crop=box, **unit, pose=pose, **sampled, **_of_format(command))
+    kind, error = type(field).__name__, None
+    if not isinstance(field, (fields.GridField, fields.SignedDistanceGrid)):
+        interpolation = command.interpolation or "quadratic"
+        field, error = fields.bake(field, nodes, interpolation=interpolation, progress=progress)
+    filled = 0.0
+    if splats and not command.hollow and isinstance(field, fields.GridField):
+        cut = command.box is not None or command.sphere is not None
+        field, before = objects.fill_hollows(field, stood=cut)
+        filled = float(before.cavity)
+    progress.close()
+    if command.to:
+        assert isinstance(field, fields.GridField)
+        _write_folder(command, field, pose)
+        return
+    fields.save_field(field, output)
+    report = _described(field, output, file, kind) | {"filled": filled}
+    report["bake_error"] = None if error is None else error.rms
+    longest = float(np.max(np.ptp(np.asarray(field.bounds), axis=0)))
+    stated = command.units is not None or command.scale not in (None, 1.0)
+    if not stated and not _USUAL[0] <= longest <= _USUAL[1]:
+        warnings.warn(
+            f"the field is {longest:.3g} m wide; if the file is not in metres, give --units (mm, in, …) or"
+            " --scale, the length of its unit [m]",
+            stacklevel=2,
+        )
+    put_json(report) if command.json else _print(report)
+
+
+def _check_folder_options(command: Import, splats: bool) -> None:
+    """Raises: ValueError: If options of splats, or of the folder, are given for something else."""
+    if not command.to:
+        if command.mass is not None:
+            raise ValueError(f"--mass goes with --to; `dano build` weighs a grid, got {command.mass}")
+        return
+    if not splats:
+        raise ValueError(
+            f"--to writes Gaussian splats (.ply) as a folder; for {command.file} take `dano import`,"
+            " `dano build` and `dano export`"
+        )
+    exchange.check_folder(command.output)
+
+
+def _write_folder(command: Import, field: fields.GridField, pose: Pose | None) -> None:
+    """An object of splats for other simulators, with the splats themselves."""
+    options = BuildOptions(
+        mass_model="solid", mass=command.mass, mass_scale=_WATER if command.mass is None else None
+    )
+    progress = Progress()
+    made = scene_file.build_object(field, options, weighed=True, dashes="--", progress=progress)
+    splats = fields.read_splats(command.file, skip_nan=command.skip_nan)
+    inside = splats.inside(command.box, command.sphere)
+    unit = (command.scale or 1.0) if command.units is None else fields.UNITS[command.units]
+    moved = splats.moved(pose, unit)
+    written = exchange.export_object(
+        made,
+        command.output,
+        to=command.to,
+        look=moved.chosen(inside),
+        surroundings=None if inside.all() else moved.chosen(~inside),
+        progress=progress,
+    )
+    progress.close()
+    if command.json:
+        put_json({**written._asdict(), "folder": str(written.folder), "mass": float(made.mass.mass)})
+        return
+    put(f"wrote {written.folder}: {inside.sum()} of {len(splats)} Gaussians")
+    put(f"  {', '.join(file for file in written.files if '/' not in file)}")
+    water = ", as dense as water (--mass says better)" if command.mass is None else ""
+    put(f"mass        {float(made.mass.mass):.4g} kg{water}")
+    for note in written.notes:
+        put(f"- {note}")
+
+
+def _of_format(command: Import) -> dict[str, Any]:
+    """Options of single formats that were given; `load_field` says which ones the file's format has."""
+    options = {
+        "interpolation": command.interpolation,
+        "spacing": command.spacing,
+        "origin": command.origin,
+        "signed_distance": command.signed_distance or None,
+        "grid": command.grid,
+        "cascade": command.cascade,
+        "up": command.up,
+        "module": command.module,
+        "skip_nan": command.skip_nan or None,
+        "box": command.box,
+        "sphere": command.sphere,
+        "undo_transform": False if command.keep_transform else None,
+    }
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _kind(file: str) -> str:
+    """What is treated specially: "mesh", "splats", or "" for everything else."""
+    suffix = Path(file).suffix.lower()
+    if suffix == ".ply" and Path(file).is_file():
+        return "splats" if fields.is_splats(Path(file)) else "mesh"
+    return "mesh" if suffix in fields.MESH_SUFFIXES else ""
+
+
+def _described(
+    field: fields.GridField | fields.SignedDistanceGrid, output: Path, file: str, kind: str
+) -> dict[str, Any]:
+    values = (
+        np.asarray(field.distances)
+        if isinstance(field, fields.SignedDistanceGrid)
+        else objects.node_values(field)
+    )
+    return {
+        "file": str(output),
+        "source": file,
+        "kind": kind,
+        "quantity": "density" if isinstance(field, fields.GridField) else "signed distance",
+        "nodes": list(values.shape),
+        "spacing": np.asarray(field.spacing).tolist(),
+        "bounds": np.asarray(field.bounds).tolist(),
+        "range": [float(values.min()), float(values.max())],
+    }
+
+
+def _print(report: dict[str, Any]) -> None:
+    put(f"field       {report['file']}, from {report['source']}")
+    low, high = report["range"]
+    put(f"{report['quantity']:<11} {low:.4g} to {high:.4g}")
+    put(f"nodes       {' × '.join(map(str, report['nodes']))}, {report['spacing'][0]:.4g} m apart")
+    put(f"bounds      {numbers(report['bounds'][0])} to {numbers(report['bounds'][1])} m")
+    if report["bake_error"] is not None:
+        put(f"sampling    {100 * report['bake_error']:.2g} % of the largest density (rms)")
+    if report["filled"]:
+        put(f"filled      {100 * report['filled']:.0f} % of the solid was hollow")
+    put()
+    put(f"`dano build {report['file']} -o OBJ.dano` makes an object of it")
+
 
 # Names of files that hold robots end so.
 _ROBOTS = (".urdf", ".xml", ".mjcf")
 
 
-def build(command: Build) -> None:
+def build(command: BuildObject) -> None:
     """See `dano build --help`."""
     output, options = command.output, command.options
     if options.mass is not None and options.mass_scale is not None:
         # Before a large field is read.
         raise ValueError(f"give either --mass or --mass-scale, got {options.mass} and {options.mass_scale}")
     sources = (command.field, *command.further)
-    parts = parts_of(sources)
+    parts = scene_file.parts_of(sources)
     for source in [Path(part.name) for part in parts] or sources:
         check_output(output, source)
     progress = Progress()
     progress("reading the field", 0.0)
     if parts:
-        made = build_parts(parts, options, dashes="--", progress=progress)
+        made = scene_file.build_parts(parts, options, dashes="--", progress=progress)
     else:
-        made = object_of_file(command.field, options, dashes="--", progress=progress)
-        if made.mass_model != "given" and (doubt := materials_doubt(command.field)):
+        made = scene_file.object_of_file(command.field, options, dashes="--", progress=progress)
+        if made.mass_model != "given" and (doubt := scene_file.materials_doubt(command.field)):
             warnings.warn(doubt, stacklevel=2)
     progress.close()
     made.save(output)
@@ -56,16 +273,9 @@ def inspect(command: Inspect) -> None:
         if png is not None:
             raise ValueError(f"--png draws neural objects only, got the robot {path}")
         return _inspect_robot(path, as_json=command.json)
-    picture = None if command.no_png else png or path.with_suffix(".png")
-    if picture is not None:
-        check_output(picture, path, suffix=".png")
-        if missing := missing_for_pictures(video=False):
-            if png is not None:
-                raise ImportError(missing)
-            say(f"warning: not drawn, {missing}")
-            picture = None
+    picture = picture_of(command, path.with_suffix(".png"), path)
     progress = Progress()
-    made = load_object(path, progress=progress)
+    made = scene_file.load_object(path, progress=progress)
     progress.close()
     report = describe(made, path)
     if picture is not None:
@@ -82,7 +292,7 @@ def inspect(command: Inspect) -> None:
         put(f"drawn in {picture}")
 
 
-def describe(made: NeuralObject, path: Path) -> dict[str, Any]:
+def describe(made: objects.NeuralObject, path: Path) -> dict[str, Any]:
     """An object in numbers and lists, in SI units."""
     mass = made.mass
     moments, axes = np.linalg.eigh(np.asarray(mass.inertia))
@@ -111,7 +321,7 @@ def describe(made: NeuralObject, path: Path) -> dict[str, Any]:
     }
 
 
-def _interior(interior: Interior) -> dict[str, float]:
+def _interior(interior: objects.Interior) -> dict[str, float]:
     return {field.name: float(getattr(interior, field.name)) for field in dataclasses.fields(interior)}
 
 
@@ -160,8 +370,8 @@ def _inspect_robot(path: Path, *, as_json: bool) -> None:
     Raises:
         ValueError: If the file is missing or broken.
     """
-    robot = read_robot(path)
-    doubts, mass = robot_doubts(robot), sum(link.mass for link in robot.links)
+    robot = robots.read_robot(path)
+    doubts, mass = robots.robot_doubts(robot), sum(link.mass for link in robot.links)
     moving = [joint for joint in robot.joints if joint.kind != "weld"]
     if as_json:
         put_json(
@@ -177,7 +387,7 @@ def _inspect_robot(path: Path, *, as_json: bool) -> None:
         return
     put(f"robot   {robot.name}, {len(robot.links)} links, {len(moving)} joints that move, {mass:.6g} kg")
     put()
-    for line in robot_tree(robot):
+    for line in robots.robot_tree(robot):
         put(line)
     put()
     put("nothing odd" if not doubts else "odd:")

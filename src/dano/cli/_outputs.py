@@ -3,11 +3,11 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from dano.archive import checked_output
 from dano.cli._arguments import (
-    Build,
+    BuildObject,
     Compare,
     Export,
     Import,
@@ -17,12 +17,15 @@ from dano.cli._arguments import (
     Train,
     UNNAMED,
 )
+from dano.cli._console import say
 from dano.cli.tracking import Track
 from dano.extras import is_installed
 
+Options = TypeVar("Options")
+
 _NAMED_AFTER: dict[type, tuple[str, str]] = {
     Train: ("images", ".dano"),
-    Build: ("field", ".dano"),
+    BuildObject: ("field", ".dano"),
     Import: ("file", ".grid.npz"),
     Simulate: ("scene", "_run.npz"),
     Track: ("video", "_motion.npz"),
@@ -55,6 +58,19 @@ def named(command: Any) -> tuple[Any, str | None]:
     output = usual if getattr(fields, "resume", False) else free_path(usual)
     line = f"wrote {output}" + ("" if output == usual else f", because {usual} was there already")
     return dataclasses.replace(fields, output=output), line
+
+
+def chosen(options: type[Options], command: Any, **given: Any) -> Options:
+    """Options of a part of dano, from those of a command that have the same names.
+
+    Args:
+        options: Their class.
+        command: The command, or a group of its options.
+        **given: Those that are called or written otherwise.
+    """
+    kind: Any = options
+    names = {field.name for field in dataclasses.fields(kind)} & vars(command).keys()
+    return options(**{name: getattr(command, name) for name in names} | given)
 
 
 def run_files(folder: Path, scenes: Sequence[Path], *, resume: bool) -> list[Path]:
@@ -139,3 +155,22 @@ def missing_for_pictures(*, video: bool) -> str | None:
     if missing := [name for name in packages if not is_installed(name)]:
         return f"pictures need {', '.join(missing)}: pip install 'dano[view]'"
     return None
+
+
+def picture_of(command: Any, usual: Path, *inputs: Path) -> Path | None:
+    """Where a command with `--png` and `--no-png` draws; None if it does not, or cannot and need not.
+
+    Raises:
+        ValueError: If the picture cannot be written.
+        ImportError: If it was asked for, and what draws it is not installed.
+    """
+    if command.no_png:
+        return None
+    picture = command.png or usual
+    check_output(picture, *inputs, suffix=".png")
+    if missing := missing_for_pictures(video=False):
+        if command.png is not None:
+            raise ImportError(missing)
+        say(f"warning: not drawn, {missing}")
+        return None
+    return picture

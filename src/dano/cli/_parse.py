@@ -18,10 +18,10 @@ from tyro.conf import FlagCreatePairsOff
 
 from dano import __version__
 from dano.cli._arguments import (
-    Build,
+    BuildObject,
     Cache,
+    CheckPhotographs,
     Compare,
-    Data,
     Demo,
     Export,
     Import,
@@ -32,7 +32,7 @@ from dano.cli._arguments import (
     Train,
     View,
 )
-from dano.cli.checking import Check
+from dano.cli.checking import CheckScene
 from dano.cli.film import Film
 from dano.cli.identifying import Identify
 from dano.cli.tracking import Track
@@ -58,19 +58,19 @@ GROUPS: dict[str, dict[str, _Row]] = {
     "From photographs and films": {
         "film": _Row(Film, "film._run:film", "dano film walk/ slide.mp4 --marker-size 0.08 -o soap.dano"),
         "poses": _Row(Poses, "_learn:poses", "dano poses photos/ --marker-size 0.05"),
-        "data": _Row(Data, "_learn:data", "dano data photos/"),
+        "data": _Row(CheckPhotographs, "_learn:data", "dano data photos/"),
         "track": _Row(Track, "tracking.run:track", "dano track throw.mp4 mug.dano --camera camera.json"),
     },
     "From fields, and to other programs": {
-        "build": _Row(Build, "_objects:build", "dano build my_nerf.npz --length 0.12 --mass 0.35"),
+        "build": _Row(BuildObject, "_objects:build", "dano build my_nerf.npz --length 0.12 --mass 0.35"),
         "import": _Row(
-            Import, "_import:import_field", "dano import step-000029999.ckpt --crop -1 -1 -1 1 1 1"
+            Import, "_objects:import_field", "dano import step-000029999.ckpt --crop -1 -1 -1 1 1 1"
         ),
-        "export": _Row(Export, "_export:export", "dano export mug.dano --to mjcf urdf"),
+        "export": _Row(Export, "_objects:export", "dano export mug.dano --to mjcf urdf"),
         "compare": _Row(Compare, "_compare:compare", "dano compare mug.dano"),
     },
     "With scenes": {
-        "check": _Row(Check, "checking._run:check", "dano check scene.toml"),
+        "check": _Row(CheckScene, "checking._run:check", "dano check scene.toml"),
         "identify": _Row(
             Identify,
             "identifying.run:identify",

@@ -403,7 +403,7 @@ def _run(
 ) -> list[dict[str, Any]]:
     """Simulate, save and draw; what came out in numbers."""
     scenes, reports, rollouts = (command.scene, command.beside), [], []
-    kept = [running.Checkpoint(output, each) for output, each in zip(outputs, loaded, strict=True)]
+    kept = [running.RunCheckpoint(output, each) for output, each in zip(outputs, loaded, strict=True)]
     for scene, each, output, checkpoint in zip(scenes, loaded, outputs, kept, strict=False):
         rollout, report = _simulated(each, output, clock, checkpoint, resume=command.resume)
         rollouts.append(rollout)
@@ -444,7 +444,7 @@ def _simulated(
     loaded: scene_file.SceneFile,
     output: Path,
     clock: running.Clock,
-    kept: running.Checkpoint | None = None,
+    kept: running.RunCheckpoint | None = None,
     *,
     resume: bool = False,
 ) -> tuple[running.Rollout, dict[str, Any]]:

@@ -9,12 +9,27 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.checks import checked_count, checked_items, checked_kind, checked_optional
-from dano.comparison._bodies import GRAVITY, Path, Probes, Rigid, rotation_of, Solid, Start, together
+from dano.comparison._bodies import (
+    best_level,
+    Drop,
+    GRAVITY,
+    Grid,
+    hull_of,
+    level_mesh,
+    Mesh,
+    nearest_rest,
+    Path,
+    pieces_of,
+    Probes,
+    Rigid,
+    rotation_of,
+    Solid,
+    stable_directions,
+    together,
+)
 from dano.comparison._mujoco import MuJoCo
 from dano.comparison._own import Own
 from dano.comparison._pybullet import has_pybullet, PyBullet
-from dano.comparison._rest import nearest_rest, stable_directions
-from dano.comparison._routes import best_level, Grid, hull_of, level_mesh, Mesh, pieces_of
 from dano.exchange import convex_hull, enclosed, Moments, signed_distances, solid_triangles, Triangles
 from dano.extras import is_installed
 from dano.fields import AbstractField, AbstractShape, bake, GridField
@@ -141,7 +156,7 @@ class _Bench(NamedTuple):
     thing: NeuralObject
     solid: Solid
     stable: Float[np.ndarray, "n 3"]
-    starts: list[Start]
+    starts: list[Drop]
     n_steps: int
     probes: Probes
     truth: NeuralObject | None
@@ -207,7 +222,24 @@ def compare(
     begin = time.perf_counter()
     own = Own(thing, TIMESTEP)
     _measured(bench, own, _own_row(bench), [], _surface(thing), rows, scenery, begin)
-    jobs = [(level, cleaned) for level in chosen for cleaned in (False, True)]
+    _measure_meshes(bench, grid, chosen, best, decomposed, say, rows, scenery)
+    say("done", 1.0)
+    reference = "the neural object" if truth is None else "the truth"
+    return Comparison(rows, scenery, reference, bench.solid.size, chosen, best, drops, missing)
+
+
+def _measure_meshes(
+    bench: _Bench,
+    grid: Grid,
+    levels: Sequence[float],
+    best: float,
+    decomposed: bool,
+    say: Callable[[str, float], object],
+    rows: list[Row],
+    scenery: list[Scenery],
+) -> None:
+    """Measure hulls of surfaces at all levels; of the best one its distance and its convex pieces, too."""
+    jobs = [(level, cleaned) for level in levels for cleaned in (False, True)]
     for i, (level, cleaned) in enumerate(jobs):
         say(f"surface at {level:.3g}", 0.1 + 0.4 * i / len(jobs))
         mesh = level_mesh(grid, level, cleaned=cleaned)
@@ -226,9 +258,6 @@ def compare(
         engines = (MuJoCo, PyBullet) if has_pybullet() else (MuJoCo,)
         for engine in engines:
             _mesh_row(bench, mesh, "best surface: CoACD", lambda _: pieces, engine, rows, scenery)
-    say("done", 1.0)
-    reference = "the neural object" if truth is None else "the truth"
-    return Comparison(rows, scenery, reference, bench.solid.size, chosen, best, drops, missing)
 
 
 def _missing(decomposed: bool) -> list[str]:
@@ -303,11 +332,11 @@ def _bench(thing: NeuralObject, truth: AbstractShape | None, drops: int, seed: i
     return _Bench(thing, solid, stable, starts, n_steps, probes, true, {})
 
 
-def _start(points: Float[np.ndarray, "n 3"], size: float, random: np.random.Generator) -> Start:
+def _start(points: Float[np.ndarray, "n 3"], size: float, random: np.random.Generator) -> Drop:
     """A random orientation, slowly turning, the lowest point a quarter of the size over the floor."""
     orientation = random.normal(size=4)
     orientation /= np.linalg.norm(orientation)
-    start = Start(np.zeros(3), orientation, 0.3 * math.sqrt(GRAVITY / size) * random.normal(size=3))
+    start = Drop(np.zeros(3), orientation, 0.3 * math.sqrt(GRAVITY / size) * random.normal(size=3))
     lowest = float((points @ rotation_of(start)[2]).min())
     return start._replace(origin=np.array([0.0, 0.0, _ABOVE * size - lowest]))
 

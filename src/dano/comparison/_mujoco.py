@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dano.comparison._bodies import FRICTION, GRAVITY, Path, Probes, Rigid, rotation_of, Start
+from dano.comparison._bodies import Drop, FRICTION, GRAVITY, Path, Probes, Rigid, rotation_of
 from dano.exchange import Triangles
 from dano.extras import optional
 from dano.maths import quat_to_matrix
@@ -48,7 +48,7 @@ class MuJoCo:
             f"<asset>{assets}</asset><worldbody>{world}<body>{body}{geoms}</body></worldbody></mujoco>"
         )
 
-    def drop(self, start: Start, n_steps: int) -> Path:
+    def drop(self, start: Drop, n_steps: int) -> Path:
         """Let the body fall on the plane z = 0."""
         mujoco, model = self._mujoco, self._model
         data = mujoco.MjData(model)

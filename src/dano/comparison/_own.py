@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
-from dano.comparison._bodies import FRICTION, GRAVITY, Path, Probes, rotation_of, Start
+from dano.comparison._bodies import Drop, FRICTION, GRAVITY, Path, Probes, rotation_of
 from dano.contact import ContactParams
 from dano.engine import simulate, VariationalEngine
 from dano.exchange import signed_distances
@@ -42,7 +42,7 @@ class Own:
             gravity=(0.0, 0.0, -GRAVITY),
         )
 
-    def drop(self, start: Start, n_steps: int) -> Path:
+    def drop(self, start: Drop, n_steps: int) -> Path:
         """Let the body fall on the plane z = 0."""
         com = np.asarray(self._thing.mass.com, np.float64)
         where = {

@@ -13,7 +13,7 @@ from pathlib import Path as FilePath
 import numpy as np
 from jaxtyping import Bool
 
-from dano.comparison._bodies import FRICTION, GRAVITY, Path, Probes, Rigid, rotation_of, Start
+from dano.comparison._bodies import Drop, FRICTION, GRAVITY, Path, Probes, Rigid, rotation_of
 from dano.exchange import write_obj
 from dano.extras import is_installed
 from dano.maths import quat_from_matrix, quat_to_matrix
@@ -74,7 +74,7 @@ class PyBullet:
         self._com, (x, y, z, w) = np.array(info[3]), info[4]
         self._principal = quat_to_matrix(np.array([w, x, y, z]))
 
-    def drop(self, start: Start, n_steps: int) -> Path:
+    def drop(self, start: Drop, n_steps: int) -> Path:
         """Let the body fall on the plane z = 0."""
         bullet, client, body = self._bullet, self._client, self._body
         rotation = rotation_of(start)

@@ -6,13 +6,11 @@ from dano.exchange._export import (
     Exported as Exported,
     Format as Format,
 )
-from dano.exchange._pieces import (
+from dano.exchange._robots import export_robot as export_robot
+from dano.exchange._triangles import (
     Collision as Collision,
     convex_hull as convex_hull,
     decomposition as decomposition,
-)
-from dano.exchange._robots import export_robot as export_robot
-from dano.exchange._triangles import (
     enclosed as enclosed,
     largest_part as largest_part,
     level_triangles as level_triangles,

@@ -11,22 +11,23 @@ from typing import Any, get_args, Literal, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from dano.checks import (
-    checked_choice,
-    checked_count,
-    checked_function,
-    checked_items,
-    checked_kind,
-    checked_number,
-    checked_optional,
-    checked_path,
-)
+from dano import checks
 from dano.contact import ContactParams
 from dano.exchange import _mjcf, _urdf, _usd
-from dano.exchange._contents import Contents, MESHES, SPLATS, SURROUNDINGS, VISUAL
-from dano.exchange._look import painted, PLAIN
-from dano.exchange._pieces import chosen_collision, convex_hull, decomposition
-from dano.exchange._triangles import solid_triangles, Triangles
+from dano.exchange._triangles import (
+    chosen_collision,
+    Contents,
+    convex_hull,
+    decomposition,
+    MESHES,
+    painted,
+    PLAIN,
+    solid_triangles,
+    SPLATS,
+    SURROUNDINGS,
+    Triangles,
+    VISUAL,
+)
 from dano.exchange._wavefront import write_image, write_material, write_obj
 from dano.fields import Splats
 from dano.memory import check_nodes
@@ -130,19 +131,19 @@ def export_object(
             wrote.
         ImportError: If libigl is missing, pillow for colours, coacd for "coacd", usd-core for "usd".
     """
-    checked_kind("obj", obj, NeuralObject)
-    target = checked_path("folder", folder)
+    checks.checked_kind("obj", obj, NeuralObject)
+    target = checks.checked_path("folder", folder)
     formats = _checked_formats(to)
     name = _checked_name(_default_name(target) if name is None else name)
-    contact = checked_optional("contact", contact, ContactParams) or ContactParams()
+    contact = checks.checked_optional("contact", contact, ContactParams) or ContactParams()
     splats, learned = (look, None) if isinstance(look, Splats) else (None, look)
     if learned is not None and not hasattr(learned, "model"):
         raise ValueError(
             f"look must be a dano.vision.LearnedField or dano.fields.Splats, got {type(look).__name__}"
         )
-    checked_optional("surroundings", surroundings, Splats)
+    checks.checked_optional("surroundings", surroundings, Splats)
     if progress is not None:
-        checked_function("progress", progress)
+        checks.checked_function("progress", progress)
     how = chosen_collision(collision)
     _check_numbers(concavity, max_pieces, resolution, texture_size)
     check_folder(target)
@@ -191,9 +192,9 @@ def _surfaces(obj: NeuralObject, resolution: int) -> tuple[Triangles, np.ndarray
 
 
 def _checked_formats(to: str | Sequence[str]) -> list[str]:
-    formats = [to] if isinstance(to, str) else list(checked_items("to", to, str))
+    formats = [to] if isinstance(to, str) else list(checks.checked_items("to", to, str))
     for form in formats:
-        checked_choice("to", form, get_args(Format))
+        checks.checked_choice("to", form, get_args(Format))
     if not formats:
         raise ValueError(f"to must name at least one of {list(get_args(Format))}, got none")
     return list(dict.fromkeys(formats))
@@ -213,11 +214,11 @@ def _checked_name(name: str) -> str:
 
 
 def _check_numbers(concavity: float, max_pieces: int | None, resolution: int, texture_size: int) -> None:
-    checked_number("concavity", concavity, least=0.01, most=1)
+    checks.checked_number("concavity", concavity, least=0.01, most=1)
     if max_pieces is not None:
-        checked_count("max_pieces", max_pieces)
-    checked_count("resolution", resolution, least=8, most=512)
-    checked_count("texture_size", texture_size, least=64, most=8192)
+        checks.checked_count("max_pieces", max_pieces)
+    checks.checked_count("resolution", resolution, least=8, most=512)
+    checks.checked_count("texture_size", texture_size, least=64, most=8192)
 
 
 def check_folder(folder: Path) -> None:

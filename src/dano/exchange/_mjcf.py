@@ -5,8 +5,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from dano.exchange._contents import Contents, MESHES, VISUAL, words
-from dano.exchange._look import PLAIN
+from dano.exchange._triangles import Contents, MESHES, PLAIN, VISUAL, words
 
 NOTES = (
     "MuJoCo: contact is with the convex pieces and as soft as its own defaults (solref, solimp). It has no"

@@ -11,7 +11,7 @@ import numpy as np
 
 from dano.archive import checked_output, replacing
 from dano.checks import checked_kind, checked_optional
-from dano.exchange._contents import words
+from dano.exchange._triangles import words
 from dano.exchange._urdf import roll_pitch_yaw
 from dano.maths import quat_to_matrix
 from dano.robots import at_home, Connection, Description, Drive, Link, Placed, Robot, Solid

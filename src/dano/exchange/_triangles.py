@@ -1,14 +1,31 @@
-"""Triangles: level surfaces of densities and of signed distances, and the volume that they enclose."""
+"""Triangles: level surfaces of densities and of signed distances, and the volume that they enclose.
 
-from typing import Any, NamedTuple
+Convex pieces that stand for an object in engines whose contacts know convex shapes only.
+What an object looks like, as other programs know it: one picture that is laid on the triangles.
+What is written of an object, whatever the format.
+"""
+
+from typing import Any, get_args, Literal, NamedTuple, TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from dano.extras import optional
-from dano.fields import AbstractShape
+from dano.contact import ContactParams
+from dano.extras import is_installed, optional
+from dano.fields import (
+    AbstractShape,
+    convex_hull as hull_of,
+    convex_pieces,
+    largest_part as connected,
+    load_coacd,
+    Splats,
+)
+
+if TYPE_CHECKING:
+    from dano.vision import LearnedField
+
 
 _MARGIN = 2
 """Nodes around a solid, so that its surface is closed."""
@@ -217,13 +234,203 @@ def largest_part(values: Float[np.ndarray, "nx ny nz"], level: float) -> Bool[np
     """Nodes of the largest connected part of {φ ≥ level}, with the cavities that it encloses."""
     from scipy import ndimage
 
-    labels, parts = ndimage.label(values >= level, np.ones((3, 3, 3)))
-    if parts == 0:
-        return np.zeros(values.shape, bool)
-    count = np.bincount(labels.ravel())
-    count[0] = 0
-    return ndimage.binary_fill_holes(labels == int(np.argmax(count)))
+    return ndimage.binary_fill_holes(connected(values >= level, corners=True))
 
 
 def _igl() -> Any:
     return optional("igl", "triangles of a field need libigl", "export")
+
+
+Collision = Literal["auto", "coacd", "hull"]
+
+
+def chosen_collision(collision: str) -> Literal["coacd", "hull"]:
+    """What is made for `collision`: "auto" is CoACD where it is installed.
+
+    Raises:
+        ValueError: If it is not one of the three.
+        ImportError: If CoACD is requested and missing.
+    """
+    if collision not in get_args(Collision):
+        raise ValueError(f"collision must be one of {list(get_args(Collision))}, got {collision!r}")
+    installed = is_installed("coacd")
+    if collision == "coacd" and not installed:
+        load_coacd()
+    return "hull" if collision == "hull" or not installed else "coacd"
+
+
+def convex_hull(points: Float[np.ndarray, "n 3"]) -> Triangles:
+    """The convex hull of points [m, F].
+
+    Raises:
+        ValueError: If they lie in a plane.
+    """
+    return Triangles(*hull_of(points))
+
+
+def decomposition(mesh: Triangles, threshold: float, most: int | None) -> list[Triangles]:
+    """Convex pieces by CoACD (Wei et al. 2022), see `dano.fields.convex_pieces`.
+
+    Raises:
+        ImportError: If coacd is missing.
+    """
+    return [Triangles(*piece) for piece in convex_pieces((mesh.vertices, mesh.faces), threshold, most)]
+
+
+PLAIN = (0.85, 0.73, 0.61)
+"""sRGB of an object of which only its density is known."""
+
+_TILT = 0.7
+"""Angle [rad] of the lamps to the normal: what is seen under them is neither glare nor shadow."""
+_N_LAMPS = 3
+"""The fewest that leave no side in shadow."""
+_POINTS_AT_ONCE = 1 << 15
+"""Points per call: some MB of intermediates."""
+_LEAST_CELL = 6
+"""Texels along the square that two triangles share."""
+
+
+class Texture(NamedTuple):
+    """A picture and where on it the triangles are."""
+
+    image: UInt8[np.ndarray, "n n 3"]  # sRGB, first row at the top, shape (n, n, 3)
+    # Coordinates (u, v) of the corners of each face, from the lower left, shape (f, 3, 2).
+    corners: Float[np.ndarray, "f 3 2"]
+
+
+def colours_at(
+    look: "LearnedField", points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Colours of places on the surface, without highlights as far as a look can be asked for that.
+
+    The mean over lamps around the normal, seen along the normal. A look that was learned from photographs
+    under unknown light has that light in it.
+
+    Args:
+        look: What photographs have taught.
+        points: [m, F].
+        normals: Unit outward normals.
+
+    Returns:
+        sRGB in [0, 1].
+    """
+    appearance = look.model.appearance
+    size = min(_POINTS_AT_ONCE, len(points))
+    found = []
+    # Lamps that were places stood some sizes away.
+    reach = 3 * float(jnp.max(look.bounds[1] - look.bounds[0])) if appearance.near_light else 0.0
+    for start in range(0, len(points), max(size, 1)):
+        n = len(points[start : start + size])
+        at, outward = (_filled(array[start : start + size], size) for array in (points, normals))
+        found.append(np.asarray(_seen(appearance, at, outward, reach))[:n])
+    return np.concatenate(found).astype(np.float64) if found else np.zeros((0, 3))
+
+
+def _filled(rows: np.ndarray, size: int) -> Float[Array, "n 3"]:
+    """Rows as one call takes them: single precision, the last one repeated."""
+    padding = np.broadcast_to(rows[-1:], (size - len(rows), 3))
+    return jnp.asarray(np.concatenate([rows, padding]), jnp.float32)
+
+
+@eqx.filter_jit
+def _seen(appearance, points, normals, reach):
+    if not appearance.lit:
+        return appearance(points, normals, -normals, normals, 0.0)
+    aside = jnp.where(jnp.abs(normals[:, :1]) < 0.7, jnp.eye(3)[None, 0], jnp.eye(3)[None, 1])
+    first = jnp.cross(normals, aside.astype(normals.dtype))
+    first = first / jnp.linalg.norm(first, axis=1, keepdims=True)
+    second = jnp.cross(normals, first)
+    total = jnp.zeros_like(points)
+    for angle in 2 * np.pi * np.arange(_N_LAMPS) / _N_LAMPS:
+        around = float(np.cos(angle)) * first + float(np.sin(angle)) * second
+        lamp = float(np.cos(_TILT)) * normals + float(np.sin(_TILT)) * around
+        lamp = jnp.where(reach > 0, points + reach * lamp, lamp)
+        total = total + appearance(points, normals, -normals, lamp, 0.0)
+    return total / _N_LAMPS
+
+
+def painted(look: "LearnedField", mesh: Triangles, normals: Float[np.ndarray, "v 3"], side: int) -> Texture:
+    """Lay the colours of a look on a mesh: two triangles share a square of the picture.
+
+    Args:
+        look: What photographs have taught.
+        mesh: At least one face.
+        normals: At the vertices.
+        side: Texels along the picture; more if triangles would get too few.
+    """
+    pairs = -(-len(mesh.faces) // 2)
+    columns = int(np.ceil(np.sqrt(pairs)))
+    cell = max(_LEAST_CELL, side // columns)
+    leg = cell - 3  # a texel's width between the two triangles, for programs that interpolate
+    face = np.arange(len(mesh.faces))
+    left, bottom = cell * (face // 2 % columns), cell * (face // 2 // columns)
+    upper = face % 2 == 1
+    row, column = np.mgrid[0:cell, 0:cell].reshape(2, -1)
+    size = columns * cell
+    image = np.zeros((size, size, 3), np.uint8)
+    for second in (False, True):
+        mine = upper == second
+        # The second triangle is the first turned by half a turn.
+        x, y = (cell - 1 - column, cell - 1 - row) if second else (column, row)
+        own = x + y <= cell - 2 + second
+        u, v = x[own] / leg, y[own] / leg
+        weights = np.stack([1 - u - v, u, v], axis=1)
+        corners, at = mesh.corners[mine], normals[mesh.faces[mine]]
+        points = np.einsum("tk,fkd->ftd", weights, corners).reshape(-1, 3)
+        across = np.einsum("tk,fkd->ftd", weights, at).reshape(-1, 3)
+        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        colour = np.rint(255 * np.clip(colours_at(look, points, across), 0, 1)).astype(np.uint8)
+        i = (bottom[mine][:, None] + row[own][None]).ravel()
+        j = (left[mine][:, None] + column[own][None]).ravel()
+        image[size - 1 - i, j] = colour
+    ends = np.array([[0, 0], [leg, 0], [0, leg]], np.float64)
+    inner = np.where(upper[:, None, None], cell - 1 - ends[None], ends[None])
+    corners = (np.stack([left, bottom], axis=1)[:, None] + inner + 0.5) / size
+    return Texture(image, corners)
+
+
+MESHES = "meshes"
+"""Folder of the meshes, in that of the object."""
+
+SPLATS, SURROUNDINGS = "splats", "surroundings"
+"""Names of the Gaussians of the object, and of what does not move with it."""
+
+VISUAL = "visual"
+"""Name of the visual mesh, its material and its picture."""
+
+
+class Contents(NamedTuple):
+    """An object as other programs take it; everything in its field frame F."""
+
+    name: str  # A letter, then letters, digits and underscores
+    mass: float  # [kg]
+    com: Float[np.ndarray, "3"]  # Centre of mass [m, F], shape (3,)
+    inertia: Float[np.ndarray, "3 3"]  # About the centre of mass, in the axes of F [kg m²], shape (3, 3)
+    mesh: Triangles  # What is seen
+    resolution: int  # Nodes along the longest axis that it was made with
+    normals: Float[np.ndarray, "v 3"]  # At its vertices, shape (v, 3)
+    texture: Texture | None  # Its colours, if they are known
+    pieces: list[Triangles]  # Convex solids whose union stands for the object in contact
+    contact: ContactParams  # Parameters of its contacts
+    splats: Splats | None = None  # Gaussians that it is drawn with, if it was seen by them
+    surroundings: Splats | None = None  # Those of what does not move with it
+
+    @property
+    def friction(self) -> float:
+        """Sliding friction [1]."""
+        return float(self.contact.sliding_friction)
+
+    def parameter(self, name: str) -> float | None:
+        """A parameter of the contact, None if it is not given."""
+        value = getattr(self.contact, name)
+        return None if value is None else float(value)
+
+    @property
+    def piece_names(self) -> list[str]:
+        """A name for each piece."""
+        return [f"collision_{i:03}" for i in range(len(self.pieces))]
+
+
+def words(numbers: Float[np.ndarray, "..."]) -> str:
+    """Numbers with all of their digits, separated by blanks."""
+    return " ".join(repr(float(x)) for x in np.ravel(numbers))

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dano.exchange._contents import Contents, MESHES, VISUAL, words
-from dano.exchange._look import PLAIN
+from dano.exchange._triangles import Contents, MESHES, PLAIN, VISUAL, words
 
 NOTES = (
     "URDF has no friction of its own. What is in <contact> is read by PyBullet, which multiplies the friction"

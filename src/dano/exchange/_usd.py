@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dano.exchange._contents import Contents, SPLATS, SURROUNDINGS, VISUAL
-from dano.exchange._look import PLAIN
-from dano.exchange._triangles import Triangles
+from dano.exchange._triangles import Contents, PLAIN, SPLATS, SURROUNDINGS, Triangles, VISUAL
 from dano.extras import optional
 from dano.fields import Splats
 from dano.maths import quat_from_matrix

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from dano.exchange._look import Texture
-from dano.exchange._triangles import Triangles
+from dano.exchange._triangles import Texture, Triangles
 from dano.extras import optional
 
 

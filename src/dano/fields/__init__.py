@@ -25,8 +25,7 @@ from dano.fields._convex import (
     hull_field as hull_field,
     load_coacd as load_coacd,
 )
-from dano.fields._ellipsoid import Ellipsoid as Ellipsoid
-from dano.fields._grid import DensityMoments as DensityMoments, GridField as GridField
+from dano.fields._grid import degree_of as degree_of, DensityMoments as DensityMoments, GridField as GridField
 from dano.fields._hash_grid import HashGrid as HashGrid
 from dano.fields._host import (
     density_at as density_at,
@@ -39,11 +38,11 @@ from dano.fields._primitives import (
     Box as Box,
     Capsule as Capsule,
     Cylinder as Cylinder,
+    Ellipsoid as Ellipsoid,
     HalfSpace as HalfSpace,
     PRIMITIVES as PRIMITIVES,
     Sphere as Sphere,
 )
-from dano.fields._redistance import redistanced as redistanced, spread_distances as spread_distances
 from dano.fields._shapes import (
     AbstractPrimitive as AbstractPrimitive,
     AbstractShape as AbstractShape,
@@ -51,9 +50,10 @@ from dano.fields._shapes import (
     SolidMoments as SolidMoments,
 )
 from dano.fields._signed_distance import (
+    redistanced as redistanced,
     SignedDistanceGrid as SignedDistanceGrid,
+    spread_distances as spread_distances,
 )
-from dano.fields._spline import degree_of as degree_of
 from dano.fields.meshes import mesh_field as mesh_field, MESH_SUFFIXES as MESH_SUFFIXES, UNITS as UNITS
 from dano.fields.readers import (
     companion_files as companion_files,

@@ -10,9 +10,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.checks import checked_count, checked_function, checked_kind
 from dano.fields._base import AbstractField
-from dano.fields._grid import GridField
+from dano.fields._grid import degree_of, GridField
 from dano.fields._host import density_at, host_jet
-from dano.fields._spline import degree_of
 from dano.keys import uniform
 from dano.maths import checked_key
 from dano.memory import check_nodes

@@ -5,14 +5,14 @@ from typing import overload
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from dano.checks import checked_kind
+from dano.compiling import one_program
 from dano.fields._base import AbstractField, check_order, Jet
 from dano.fields._grid import GridField
 from dano.fields._shapes import AbstractShape, checked_edge, scaled_moments, SolidMoments
 from dano.fields._signed_distance import SignedDistanceGrid
-from dano.hosted import hosted
 from dano.maths import checked_array, einsum, Pose, product
 
 
@@ -144,7 +144,7 @@ class PosedField(AbstractField):
     pose: Pose
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Axis-aligned box [m] around the moved bounds of the inner field."""
         return posed_bounds(self.field.bounds, self.pose)
@@ -184,13 +184,13 @@ class PosedShape(AbstractShape):
         return self.shape.edge
 
     @property
-    @hosted
+    @one_program
     def size(self) -> Float[Array, ""]:
         """Size of the inner shape [m], so that turning a shape does not change its smooth edge."""
         return self.shape.size
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Axis-aligned box [m] around the moved bounds of the inner shape."""
         return posed_bounds(self.shape.bounds, self.pose)
@@ -207,7 +207,7 @@ class PosedShape(AbstractShape):
         """See `AbstractShape.sdf_jet`."""
         return _posed_jet(self.shape.sdf_jet, self.pose, x, order)
 
-    @hosted
+    @one_program
     def solid_moments(self) -> SolidMoments | None:
         """Moments of the inner shape, moved: V, R c + p, R S Rᵀ."""
         moments = self.shape.solid_moments()
@@ -242,7 +242,7 @@ class ScaledField(AbstractField):
     factor: Float[Array, ""]
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Scaled bounds [m] of the inner field."""
         return self.field.bounds * self.factor.astype(self.field.bounds.dtype)
@@ -283,13 +283,13 @@ class ScaledShape(AbstractShape):
         return None if edge is None else edge * self.factor.astype(edge.dtype)
 
     @property
-    @hosted
+    @one_program
     def size(self) -> Float[Array, ""]:
         """Scaled size of the inner shape [m]."""
         return self.shape.size * self.factor.astype(self.shape.size.dtype)
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Scaled bounds [m] of the inner shape."""
         return self.shape.bounds * self.factor.astype(self.shape.bounds.dtype)
@@ -308,7 +308,7 @@ class ScaledShape(AbstractShape):
         factor = self.factor.astype(x.dtype)
         return jax.tree.map(lambda part: factor * part, _scaled_jet(self.shape.sdf_jet, factor, x, order))
 
-    @hosted
+    @one_program
     def solid_moments(self) -> SolidMoments | None:
         """Moments of the inner shape: V s³, c s, S s⁵."""
         moments = self.shape.solid_moments()
@@ -318,6 +318,16 @@ class ScaledShape(AbstractShape):
 def _joined_bounds(fields: tuple[AbstractField, ...]) -> Float[Array, "2 3"]:
     bounds = jnp.stack([field.bounds for field in fields])
     return jnp.stack([jnp.min(bounds[:, 0], axis=0), jnp.max(bounds[:, 1], axis=0)])
+
+
+def _of_part(index: Int[Array, " n"], jets: list[Jet]) -> Jet:
+    """At each point the jet of one of the parts."""
+
+    def chosen(*rows: Array) -> Array:
+        choice = jnp.broadcast_to(index, (1, *rows[0].shape))
+        return jnp.take_along_axis(jnp.stack(rows), choice, axis=0)[0]
+
+    return jax.tree.map(chosen, *jets)
 
 
 class UnionField(AbstractField):
@@ -330,7 +340,7 @@ class UnionField(AbstractField):
     fields: tuple[AbstractField, ...]
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Box [m] around the bounds of all parts."""
         return _joined_bounds(self.fields)
@@ -350,14 +360,7 @@ class UnionField(AbstractField):
         jets = [field.jet(x, order) for field in self.fields]
         if order == 0:
             return jnp.max(jnp.stack(jets), axis=0)
-        densest = jnp.argmax(jnp.stack([jet[0] for jet in jets]), axis=0)
-
-        def choose(*parts: Array) -> Array:
-            stacked = jnp.stack(parts)
-            index = jnp.broadcast_to(densest, (1, *stacked.shape[1:]))
-            return jnp.take_along_axis(stacked, index, axis=0)[0]
-
-        return jax.tree.map(choose, *jets)
+        return _of_part(jnp.argmax(jnp.stack([jet[0] for jet in jets]), axis=0), jets)
 
 
 class UnionShape(AbstractShape):
@@ -371,7 +374,7 @@ class UnionShape(AbstractShape):
     edge: Float[Array, ""] | None
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Box [m] around the bounds of all parts."""
         return _joined_bounds(self.shapes)
@@ -385,13 +388,7 @@ class UnionShape(AbstractShape):
         parts = [shape.sdf_jet(x, order) for shape in self.shapes]
         if order == 0:
             return jnp.min(jnp.stack(parts), axis=0)
-        nearest = jnp.argmin(jnp.stack([part[0] for part in parts]), axis=0)
-
-        def of_nearest(*rows: Array) -> Array:
-            choice = jnp.broadcast_to(nearest, (1, *rows[0].shape))
-            return jnp.take_along_axis(jnp.stack(rows), choice, axis=0)[0]
-
-        return jax.tree.map(of_nearest, *parts)
+        return _of_part(jnp.argmin(jnp.stack([part[0] for part in parts]), axis=0), parts)
 
     def solid_moments(self) -> None:
         """None: parts may overlap, so their moments do not add."""

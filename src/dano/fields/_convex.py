@@ -7,8 +7,7 @@ from jaxtyping import Float, Int
 
 from dano.checks import checked_count
 from dano.extras import DISTANCES, optional
-from dano.fields._redistance import spread_distances
-from dano.fields._signed_distance import SignedDistanceGrid
+from dano.fields._signed_distance import SignedDistanceGrid, spread_distances
 from dano.fields.meshes import mesh_moments
 from dano.maths import even_directions
 

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from dano.compiling import one_program
 from dano.fields._base import AbstractField, check_order, Jet, vmapped_jet
-from dano.hosted import hosted
 from dano.maths import AnyArray, checked_array, column_norm, is_traced, library, Numbers, Q
 
 DEFAULT_EDGE = 0.005
@@ -96,13 +96,13 @@ class AbstractShape(AbstractField):
         """Volume, centroid and second moment of the solid in closed form, or None if there is none."""
 
     @property
-    @hosted
+    @one_program
     def size(self) -> Float[Array, ""]:
         """Largest extent of the bounds [m]; infinite for a half-space."""
         return jnp.max(self.bounds[1] - self.bounds[0])
 
     @property
-    @hosted
+    @one_program
     def edge_width(self) -> Float[Array, ""]:
         """Width of the smooth edge in force [m]: `edge`, else 0.5 % of `size`, else (infinite size) 0."""
         if self.edge is not None:
@@ -228,13 +228,13 @@ class AbstractCentred(AbstractPrimitive):
         """Half the side lengths [m] of the tightest box around the solid."""
 
     @property
-    @hosted
+    @one_program
     def size(self) -> Float[Array, ""]:
         """Largest extent of the solid [m]."""
         return 2 * jnp.max(self._half_extents)
 
     @property
-    @hosted
+    @one_program
     def bounds(self) -> Float[Array, "2 3"]:
         """Lower and upper corner [m, F] of the solid and its smooth edge."""
         return symmetric(self._half_extents, self.edge_width)

@@ -6,17 +6,10 @@ from typing import Any
 
 import jax
 
-from dano.checks import (
-    checked_choice,
-    checked_count,
-    checked_function,
-    checked_kind,
-    checked_number,
-    checked_optional,
-)
+from dano import checks
 from dano.engine import AbstractEngine, VariationalEngine
 from dano.extras import optional
-from dano.gym._rendering import MODES, Rendering
+from dano.gym._environments import MODES, Rendering
 from dano.gym._rules import Rules, Start
 from dano.planning import Task
 from dano.scene import Scene, State
@@ -113,7 +106,7 @@ def make_vector_env(
     optional("gymnasium", _NEED, "gym")
     from dano.gym._environments import SceneVectorEnv
 
-    n_envs = checked_count("n_envs", n_envs)
+    n_envs = checks.checked_count("n_envs", n_envs)
     rules = _checked(scene, state, task, start, repeat, shaping, engine)
     # A page shows one episode.
     rendering = _rendering(rules, state, render_mode, MODES[:1], size, camera, n_envs)
@@ -139,7 +132,7 @@ def stable_baselines_env(env: Any) -> Any:
     from dano.gym._environments import SceneVectorEnv
     from dano.gym._stable_baselines import StableBaselinesEnv
 
-    return StableBaselinesEnv(checked_kind("env", env, SceneVectorEnv))
+    return StableBaselinesEnv(checks.checked_kind("env", env, SceneVectorEnv))
 
 
 def make_env_of_files(scene: str | os.PathLike[str], task: str | os.PathLike[str], **options: Any) -> Any:
@@ -187,16 +180,16 @@ def _checked(
     shaping: float,
     engine: AbstractEngine | None,
 ) -> Rules:
-    checked_kind("scene", scene, Scene).check_state(state)
-    checked_kind("task", task, Task)
-    checked_optional("engine", engine, AbstractEngine)
+    checks.checked_kind("scene", scene, Scene).check_state(state)
+    checks.checked_kind("task", task, Task)
+    checks.checked_optional("engine", engine, AbstractEngine)
     if start is not None:
-        checked_function("start", start)
+        checks.checked_function("start", start)
     if jax.tree.leaves(state)[0].ndim != 2:
         raise ValueError(f"state must be one state, got leaves of shape {jax.tree.leaves(state)[0].shape}")
     task.check(scene)
-    repeat = checked_count("repeat", repeat)
-    shaping = checked_number("shaping", shaping, least=0)
+    repeat = checks.checked_count("repeat", repeat)
+    shaping = checks.checked_number("shaping", shaping, least=0)
     return Rules(scene, task, engine or VariationalEngine(), repeat, shaping)
 
 
@@ -210,6 +203,6 @@ def _rendering(
     n_envs: int = 1,
 ) -> Rendering:
     if mode is not None:
-        checked_choice("render_mode", mode, modes)
+        checks.checked_choice("render_mode", mode, modes)
     period = rules.repeat * float(rules.scene.timestep)
     return Rendering(rules.scene, state, mode, period, size, camera, n_envs)

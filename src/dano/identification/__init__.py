@@ -2,8 +2,12 @@
 
 from dano.identification._identify import identify as identify
 from dano.identification._parameters import Parameter as Parameter, parameter_of as parameter_of
-from dano.identification._result import Errors as Errors, Identification as Identification, Minimum as Minimum
 from dano.identification._settings import IdentifyOptions as IdentifyOptions
+from dano.identification._uncertainty import (
+    Errors as Errors,
+    Identification as Identification,
+    Minimum as Minimum,
+)
 from dano.identification.motions import (
     load_motion as load_motion,
     Motion as Motion,

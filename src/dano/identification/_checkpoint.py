@@ -34,7 +34,7 @@ class Simulated(Protocol):
         ...
 
 
-class Checkpoint:
+class SearchCheckpoint:
     """The minimisations of a search, one after the other: those that have ended, and where the last one is.
 
     A search that goes on does the same as before, and so asks for the same minimisations. Those that have

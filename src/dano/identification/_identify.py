@@ -13,7 +13,7 @@ import numpy as np
 
 from dano.checks import checked_function, checked_items, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, held, Policy
-from dano.identification._checkpoint import Checkpoint, digest_of
+from dano.identification._checkpoint import digest_of, SearchCheckpoint
 from dano.identification._parameters import (
     masses_of,
     Parameter,
@@ -24,11 +24,10 @@ from dano.identification._parameters import (
 )
 from dano.identification._problem import Problem
 from dano.identification._residuals import Linearized, shifted, Smoothing
-from dano.identification._result import Errors, Identification, Minimum
 from dano.identification._scales import check_scales
 from dano.identification._settings import deviations, estimated, IdentifyOptions, Setup
 from dano.identification._settling import ripple_covariance, worth_of
-from dano.identification._uncertainty import scattered, uncertainty
+from dano.identification._uncertainty import Errors, Identification, Minimum, scattered, uncertainty
 from dano.identification._windows import Plan
 from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
@@ -121,7 +120,7 @@ def _fitted(
     held: tuple[Motion, ...],
     state: State | Sequence[State | None] | None,
     after: Identification | None,
-    kept: Checkpoint,
+    kept: SearchCheckpoint,
     progress: Callable[[str, float], None] | None,
 ) -> Identification:
     """Searches from all starts, and measures the error on what is held out."""
@@ -139,13 +138,15 @@ def _fitted(
     return found
 
 
-def _kept(setup: Setup, motions: tuple[Motion, ...], state: Any, after: Identification | None) -> Checkpoint:
+def _kept(
+    setup: Setup, motions: tuple[Motion, ...], state: Any, after: Identification | None
+) -> SearchCheckpoint:
     """Where the search is kept; with `resume`, what was kept there."""
     options = setup.options
     if options.checkpoint is None:
-        return Checkpoint(None, "")
+        return SearchCheckpoint(None, "")
     begun = None if after is None else after.initial_states
-    kept = Checkpoint(Path(options.checkpoint), digest_of(setup, motions, state, begun))
+    kept = SearchCheckpoint(Path(options.checkpoint), digest_of(setup, motions, state, begun))
     if options.resume:
         kept.read()
     return kept
@@ -182,7 +183,7 @@ class _Ended(NamedTuple):
 
 
 def _searched(
-    problem: Problem, options: IdentifyOptions, kept: Checkpoint, tell: Callable[[str, float], None]
+    problem: Problem, options: IdentifyOptions, kept: SearchCheckpoint, tell: Callable[[str, float], None]
 ) -> list[_Ended]:
     """Where the search from each start ended, best first."""
     ended = []

@@ -173,7 +173,7 @@ class _Leaves:
         return jax.tree.unflatten(structure, leaves)
 
 
-class _Place:
+class _LeafPlace:
     """Stands for a leaf of a tree."""
 
     def __init__(self, index: int):
@@ -276,10 +276,10 @@ def _picked(p: Parameter, what: str, home: Any) -> tuple[np.ndarray, Callable[[A
             )
     structure = jax.tree.structure(home)
     try:
-        picked = _leaves(where, jax.tree.unflatten(structure, map(_Place, range(structure.num_leaves))))
+        picked = _leaves(where, jax.tree.unflatten(structure, map(_LeafPlace, range(structure.num_leaves))))
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(not_whole) from error
-    places = tuple(each.index for each in picked if isinstance(each, _Place))
+    places = tuple(each.index for each in picked if isinstance(each, _LeafPlace))
     if len(places) < len(leaves):
         raise ValueError(not_whole)
     if len(set(places)) < len(places):

@@ -26,7 +26,7 @@ class Smoothing(NamedTuple):
     upper: Float[Array, " p"]  # Bounds; may be ∞
 
 
-class Plane(NamedTuple):
+class LossPlane(NamedTuple):
     """The plane through the residuals around a point."""
 
     value: Float[Array, " r"]  # At the point
@@ -41,7 +41,7 @@ def plane_through(
     smoothing: Smoothing,
     spread,
     inverse,
-) -> tuple[Plane, Any]:
+) -> tuple[LossPlane, Any]:
     """The plane around a point, and what else the residuals at the point say; see `Smoothing`."""
     draws = smoothing.draws
     moves = product(draws, spread.T)
@@ -57,7 +57,7 @@ def plane_through(
     ripple = jnp.sqrt(jnp.asarray(share, rows.dtype)) * (odd - product(draws, by_draw))
     slope = product(by_draw.T, inverse)
     value = 0.5 * jnp.mean(above + below, axis=0) + product(slope, at - middle)
-    return Plane(value, slope, ripple), jax.tree.map(lambda leaf: leaf[0], others)
+    return LossPlane(value, slope, ripple), jax.tree.map(lambda leaf: leaf[0], others)
 
 
 def _inside(at: Float[Array, " u"], moves: Float[Array, "k u"], lower, upper) -> Float[Array, " u"]:

@@ -1,4 +1,7 @@
-"""The least squares problem: residuals of all windows over parameters and initial states, and its search."""
+"""The least squares problem: residuals of all windows over parameters and initial states, and its search.
+
+Normal equations of motions whose windows are to meet.
+"""
 
 import dataclasses
 import functools
@@ -11,18 +14,70 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.engine import device_mesh
-from dano.identification._chains import by_owner, chained, unchained
-from dano.identification._checkpoint import Checkpoint
+from dano.identification._checkpoint import SearchCheckpoint
 from dano.identification._planes import Smoothing
-from dano.identification._residuals import Linearized, linearized, losses, Model, moved, shifted, Start
-from dano.identification._result import Identification
+from dano.identification._residuals import (
+    Linearized,
+    linearized,
+    losses,
+    moved,
+    ResidualModel,
+    shifted,
+    WindowStart,
+)
 from dano.identification._settings import Setup, start_deviations
 from dano.identification._settling import settled
-from dano.identification._uncertainty import Groups
+from dano.identification._uncertainty import Groups, Identification
 from dano.identification._windows import draw_velocities, plan_windows
 from dano.identification.motions import Motion, QUANTITIES
 from dano.scene import Control, Scene, State
 from dano.solvers import bounded_least_squares, eliminated, NormalEquations, Solution, Stop
+
+
+def chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:
+    """Normal equations with one block for each motion, whose windows are tied by their jumps."""
+    counts = np.bincount(owner)
+    size = int(counts.max()) * k
+    place = np.concatenate([np.arange(n) for n in counts])
+    m = len(counts)
+    shared, shared_hessian = gradient[:, :p].sum(axis=0), hessian[:, :p, :p].sum(axis=0)
+    g, b, c = np.zeros((m, size)), np.zeros((m, size, size)), np.zeros((m, size, p))
+    # Windows that a shorter motion does not have stay where they are.
+    for i, n in enumerate(counts):
+        tail = np.arange(n * k, size)
+        b[i, tail, tail] = 1.0
+    losses = by_owner(owner, loss, jump)
+    # The jump falls one to one as the next window's beginning moves towards the end of this one.
+    step = 1 / np.asarray(jumps)
+    for w, (i, j) in enumerate(zip(owner, place, strict=True)):
+        mine = slice(j * k, (j + 1) * k)
+        g[i, mine] += gradient[w, p:]
+        b[i, mine, mine] += hessian[w, p:, p:]
+        c[i, mine] += hessian[w, p:, :p]
+        if j + 1 == counts[i]:
+            continue
+        by_x, by_mine, by_next = slope[w, :, :p], slope[w, :, p:], -np.diag(step)
+        following = slice((j + 1) * k, (j + 2) * k)
+        shared += by_x.T @ jump[w]
+        shared_hessian += by_x.T @ by_x
+        for rows, a in ((mine, by_mine), (following, by_next)):
+            g[i, rows] += a.T @ jump[w]
+            c[i, rows] += a.T @ by_x
+            for columns, d in ((mine, by_mine), (following, by_next)):
+                b[i, rows, columns] += a.T @ d
+    return NormalEquations(float(losses.sum()), shared, shared_hessian, g, b, c, losses)
+
+
+def by_owner(owner: np.ndarray, loss: np.ndarray, jump: np.ndarray) -> np.ndarray:
+    """Loss of each motion, jumps between its windows included."""
+    return np.bincount(owner, loss + 0.5 * np.sum(jump**2, axis=1))
+
+
+def unchained(change: np.ndarray, owner: np.ndarray, k: int) -> np.ndarray:
+    """Changes of motions as those of their windows, of k numbers each."""
+    counts = np.bincount(owner)
+    return np.concatenate([change[i, : n * k].reshape(n, k) for i, n in enumerate(counts)])
+
 
 # Points whose loss is computed for each start that is refined.
 _LOOKS = 4
@@ -45,7 +100,7 @@ _BATCH = 1024
 class _Last(NamedTuple):
     """The last simulation, and what it was of."""
 
-    model: Model
+    model: ResidualModel
     smoothing: Smoothing | None
     x: Array
     states: tuple[State, State]
@@ -106,7 +161,7 @@ class Problem:
             # Velocities that were not observed may miss by what would move a window's end by the noise.
             span = max(1e-6, float(self.plan.n_steps * scene.timestep))
             self.jumps = jnp.asarray(self.start.widths(self._usual(span)), dtype)
-        self.model = Model(
+        self.model = ResidualModel(
             scene,
             policy,
             setup.engine,
@@ -137,19 +192,13 @@ class Problem:
             raise ValueError(
                 f"options.independent must be one label for each of {motions} motions, got {len(independent)}"
             )
-        count, least = len(np.unique(self._labels(independent))), len(self.space.start) + 2
+        count, least = len(np.unique(_labels(self, independent))), len(self.space.start) + 2
         if count < least:
             what = independent if isinstance(independent, str) else "labels"
             raise ValueError(
                 f"options.independent needs at least {least} {what}, two more than there are parameters, got"
                 f" {count}"
             )
-
-    def _labels(self, independent: str | Sequence[str]) -> np.ndarray:
-        """Of each window, what it shares errors with."""
-        if independent == "windows":
-            return np.arange(len(self.plan.rows))
-        return self.plan.owner if independent == "motions" else np.array(independent)[self.plan.owner]
 
     def begin_near(self, after: Identification) -> None:
         """Begin where an earlier fit left what it estimated of the windows' states, if this one does too."""
@@ -222,7 +271,7 @@ class Problem:
 
     def groups(self, found: Linearized, independent: str | Sequence[str]) -> Groups:
         """What each independent group of a simulation says of the parameters; see `IdentifyOptions`."""
-        labels = self._labels(independent)
+        labels = _labels(self, independent)
         arrays = [np.asarray(v, float) for v in found[:5]]
         parts = []
         for label in np.unique(labels):
@@ -271,7 +320,7 @@ class Problem:
         if starts is None:
             if self._near or not bounded or len(lower) > _SCANNED:
                 return [self.space.start]
-            tried = [self.space.start, *self._spread(_SCANS)]
+            tried = [self.space.start, *_spread(self, _SCANS)]
             # The program of the search itself: another one takes longer to compile than this.
             found = [self.linearize(x, self.plan.start).loss for x in tried]
             return [tried[int(np.argmin(np.where(np.isfinite(found), found, np.inf)))]]
@@ -279,17 +328,10 @@ class Problem:
             return [self.space.start]
         if not bounded:
             raise ValueError("options.starts > 1 needs finite bounds on every parameter")
-        tried = self._spread(_LOOKS * (starts - 1))
+        tried = _spread(self, _LOOKS * (starts - 1))
         found = np.array([self.loss(x, self.plan.start) for x in tried])
         order = np.argsort(np.where(np.isfinite(found), found, np.inf))
         return [self.space.start] + [tried[i] for i in order[: starts - 1]]
-
-    def _spread(self, count: int) -> np.ndarray:
-        """So many points all over the bounds."""
-        from scipy.stats import qmc
-
-        unit = qmc.Sobol(len(self.space.start), seed=self.seed).random(1 << (count - 1).bit_length())[:count]
-        return self.space.lower + unit * (self.space.upper - self.space.lower)
 
     def search(
         self,
@@ -298,7 +340,7 @@ class Problem:
         tolerance: float,
         tell,
         free: bool = True,
-        kept: Checkpoint | None = None,
+        kept: SearchCheckpoint | None = None,
     ) -> Solution:
         """Minimise from x; with `free` false over the initial states alone.
 
@@ -433,7 +475,7 @@ class Problem:
         other = minimise(solution.x, _where(windows, begin, solution.blocks), held=held)
         if other.stop is Stop.INTERRUPTED:
             return solution._replace(stop=Stop.INTERRUPTED), False
-        here, there = self._by_motion(found), self._by_motion(self.simulate(solution.x, other.blocks))
+        here, there = _by_motion(self, found), _by_motion(self, self.simulate(solution.x, other.blocks))
         better = there < here - _BETTER
         if not better.any():
             return solution, False
@@ -453,8 +495,26 @@ class Problem:
         worse = mean > _POOR * np.median(mean) if len(mean) > 2 else np.ones(len(mean), bool)
         return worse & (losses > _BETTER)
 
-    def _by_motion(self, found: Linearized) -> np.ndarray:
-        return by_owner(self.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
+
+def _labels(problem: Problem, independent: str | Sequence[str]) -> np.ndarray:
+    """Of each window, what it shares errors with."""
+    if independent == "windows":
+        return np.arange(len(problem.plan.rows))
+    return problem.plan.owner if independent == "motions" else np.array(independent)[problem.plan.owner]
+
+
+def _spread(problem: Problem, count: int) -> np.ndarray:
+    """So many points all over the bounds."""
+    from scipy.stats import qmc
+
+    unit = qmc.Sobol(len(problem.space.start), seed=problem.seed).random(1 << (count - 1).bit_length())[
+        :count
+    ]
+    return problem.space.lower + unit * (problem.space.upper - problem.space.lower)
+
+
+def _by_motion(problem: Problem, found: Linearized) -> np.ndarray:
+    return by_owner(problem.plan.owner, np.asarray(found.loss), np.asarray(found.jump))
 
 
 def _following(start: State) -> State:
@@ -475,13 +535,13 @@ def _where(windows: np.ndarray, one: State, other: State) -> State:
     return jax.tree.map(lambda a, b: jnp.where(pick.reshape(-1, *[1] * (a.ndim - 1)), a, b), one, other)
 
 
-def _start_of(scene: Scene, bodies: Sequence[int], initial: tuple[str, ...]) -> Start:
+def _start_of(scene: Scene, bodies: Sequence[int], initial: tuple[str, ...]) -> WindowStart:
     """What is estimated of initial states when some bodies were observed."""
     layout = scene.layout
     kinds = [scene.joints[j].kind for j in layout.with_coordinates]
     on_joints = any(i in layout.children for i in bodies)
     free = tuple(i for i in bodies if i in layout.free)
-    return Start(free, tuple(kind == "hinge" for kind in kinds) if on_joints else (), initial)
+    return WindowStart(free, tuple(kind == "hinge" for kind in kinds) if on_joints else (), initial)
 
 
 def _for_each(name: str, given: Any, motions: Sequence[Motion]) -> list[Any]:

@@ -20,21 +20,18 @@ from dano.maths import einsum, quat_conjugate, quat_log, quat_multiply, quat_nor
 from dano.scene import Control, Scene, State
 
 
-class Start(NamedTuple):
+class WindowStart(NamedTuple):
     """What is estimated of the state in which a window begins (static).
 
     Unknowns are, body by body, three numbers of each quantity, then coordinates of the joints, then their
     velocities.
-
-    Attributes:
-        free: Bodies that were observed and move freely.
-        turning: Of each joint coordinate whether it is an angle; none if no body on a joint was observed.
-        initial: Quantities that are estimated. Coordinates of joints are with positions or orientations,
-            their velocities with velocities or spins.
     """
 
-    free: tuple[int, ...]
+    free: tuple[int, ...]  # Bodies that were observed and move freely
+    # Of each joint coordinate whether it is an angle; none if no body on a joint was observed.
     turning: tuple[bool, ...]
+    # Quantities that are estimated. Coordinates of joints are with positions or orientations, their
+    # velocities with velocities or spins.
     initial: tuple[str, ...]
 
     @property
@@ -97,7 +94,7 @@ class Start(NamedTuple):
         return np.concatenate([of_bodies, q, v])
 
 
-class Model(NamedTuple):
+class ResidualModel(NamedTuple):
     """What residuals depend on besides the unknowns; its static part decides the program."""
 
     scene: Scene  # The scene
@@ -112,7 +109,7 @@ class Model(NamedTuple):
     selections: tuple[Selection, ...]  # The parameters
     bodies: tuple[int, ...]  # Which bodies were observed
     quantities: tuple[str, ...]  # Which quantities count
-    start: Start  # What of the initial states is estimated
+    start: WindowStart  # What of the initial states is estimated
     n_steps: int  # Steps of each window
     reverse: bool  # Whether Jacobians are taken in reverse mode
     batch: int  # How many windows a device simulates at once
@@ -152,7 +149,7 @@ class _Late(eqx.Module):
 
 
 def linearized(
-    model: Model,
+    model: ResidualModel,
     x: Float[Array, " p"],
     start: State,
     following: State,
@@ -189,7 +186,7 @@ def linearized(
 
 @compiled
 def _linearized(
-    model: Model,
+    model: ResidualModel,
     x: Float[Array, " p"],
     start: State,
     following: State,
@@ -244,7 +241,7 @@ def _linearized(
     return map_rows(one_or_none, rows, batch_size=model.batch, mesh=model.mesh)
 
 
-def _nothing(model: Model, state: State, p: int, draws: int) -> Linearized:
+def _nothing(model: ResidualModel, state: State, p: int, draws: int) -> Linearized:
     """Zeros in place of a window."""
     frames, bodies = model.windows.frame[0].shape[1], len(model.bodies)
     unknowns = p + len(_no_change(model))
@@ -268,7 +265,7 @@ def _nothing(model: Model, state: State, p: int, draws: int) -> Linearized:
 
 
 @compiled
-def losses(model: Model, x: Float[Array, " p"], start: State, following: State) -> Float[Array, " w"]:
+def losses(model: ResidualModel, x: Float[Array, " p"], start: State, following: State) -> Float[Array, " w"]:
     """Losses of windows, jumps included, without derivatives."""
 
     def one(item):
@@ -280,7 +277,7 @@ def losses(model: Model, x: Float[Array, " p"], start: State, following: State) 
 
 
 @compiled
-def moved(start: State, change: Float[Array, "w k"], unknowns: Start) -> State:
+def moved(start: State, change: Float[Array, "w k"], unknowns: WindowStart) -> State:
     """Initial states after a change of their estimated parts."""
     return jax.vmap(unknowns.moved)(start, change)
 
@@ -290,15 +287,15 @@ def _rows_of(state: State) -> State:
     return dataclasses.replace(state, v=None)
 
 
-def _no_change(model: Model) -> Float[Array, " k"]:
+def _no_change(model: ResidualModel) -> Float[Array, " k"]:
     return jnp.zeros(model.start.size, model.scene.timestep.dtype)
 
 
-def _bodies(model: Model) -> np.ndarray:
+def _bodies(model: ResidualModel) -> np.ndarray:
     return np.array(model.bodies)
 
 
-def _residuals(model: Model, window: Windows, start: State, following: State, x, change):
+def _residuals(model: ResidualModel, window: Windows, start: State, following: State, x, change):
     """Residuals (frames, bodies, quantities, 3) in standard deviations, and what they were computed from."""
     scene = with_values(model.selections, "scene", model.scene, x)
     controls = window.controls
@@ -364,7 +361,7 @@ def shifted(scene: Scene, state: State, origins, sign: int) -> State:
     )
 
 
-def _row(model: Model, window: Windows, predicted: State, key: str) -> Float[Array, "f b 3"]:
+def _row(model: ResidualModel, window: Windows, predicted: State, key: str) -> Float[Array, "f b 3"]:
     bodies = _bodies(model)
     if key == "q":
         assert predicted.q is not None and window.joints is not None
@@ -379,7 +376,7 @@ def _row(model: Model, window: Windows, predicted: State, key: str) -> Float[Arr
     return weight * (found - seen)
 
 
-def _whitened(model: Model, rows: Float[Array, "f b q 3"], window: Windows) -> Array:
+def _whitened(model: ResidualModel, rows: Float[Array, "f b q 3"], window: Windows) -> Array:
     """Residuals of poses as independent ones of variance one; others as they are."""
     poses = [key for key in ("position", "orientation") if key in model.quantities]
     if not poses:
@@ -397,7 +394,7 @@ def _whitened(model: Model, rows: Float[Array, "f b q 3"], window: Windows) -> A
     return rows.at[:, :, np.array(index)].set(white.reshape(*rows.shape[:2], len(index), 3))
 
 
-def _robust(model: Model, rows: Float[Array, "f b q 3"]):
+def _robust(model: ResidualModel, rows: Float[Array, "f b q 3"]):
     """Weight and length of each residual, and the loss."""
     squared = jnp.sum(rows * rows, axis=-1)
     lengths = jnp.sqrt(squared)

@@ -7,15 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dano.checks import (
-    checked_choice,
-    checked_count,
-    checked_items,
-    checked_kind,
-    checked_number,
-    checked_path,
-    shown,
-)
+from dano import checks
 from dano.engine import AbstractEngine
 from dano.identification._parameters import Space
 from dano.identification.motions import Motion, QUANTITIES
@@ -82,31 +74,31 @@ class IdentifyOptions:
             ValueError: If one is out of range, or does not fit the others.
         """
         if self.window is not None:
-            checked_count("window", self.window, least=2)
+            checks.checked_count("window", self.window, least=2)
         if self.gaps and self.window is None:
             raise ValueError(f"continuity needs window, got continuity {self.continuity} and window None")
         if self.huber is not None:
-            checked_number("huber", self.huber, above=0)
+            checks.checked_number("huber", self.huber, above=0)
         if isinstance(self.independent, str):
-            checked_choice("independent", self.independent, INDEPENDENT)
+            checks.checked_choice("independent", self.independent, INDEPENDENT)
         else:
-            checked_items("independent", self.independent, str)
+            checks.checked_items("independent", self.independent, str)
         if self.independent == "windows" and self.gaps:
             raise ValueError(
                 "independent='windows' excludes continuity: windows that must meet are one motion"
             )
         if self.starts is not None:
-            checked_count("starts", self.starts, most=_MOST_STARTS)
-        checked_count("seed", self.seed, least=0)
-        checked_count("max_iterations", self.max_iterations)
-        checked_number("tolerance", self.tolerance, above=0)
-        checked_choice("jacobian", self.jacobian, _JACOBIANS)
+            checks.checked_count("starts", self.starts, most=_MOST_STARTS)
+        checks.checked_count("seed", self.seed, least=0)
+        checks.checked_count("max_iterations", self.max_iterations)
+        checks.checked_number("tolerance", self.tolerance, above=0)
+        checks.checked_choice("jacobian", self.jacobian, _JACOBIANS)
         if self.batch is not None:
-            checked_count("batch", self.batch)
+            checks.checked_count("batch", self.batch)
         if self.checkpoint is None:
             if self.resume:
                 raise ValueError("resume needs a checkpoint to go on from, got checkpoint None")
-        elif checked_path("checkpoint", self.checkpoint).suffix.lower() != ".npz":
+        elif checks.checked_path("checkpoint", self.checkpoint).suffix.lower() != ".npz":
             raise ValueError(f"checkpoint must end in .npz, got {self.checkpoint}")
 
     @property
@@ -119,7 +111,7 @@ class IdentifyOptions:
         if gaps.ndim > 1 or not positive or np.any(np.diff(gaps) >= 0):
             raise ValueError(
                 "continuity must be finite and > 0, and a sequence of it must fall, got"
-                f" {shown(self.continuity)}"
+                f" {checks.shown(self.continuity)}"
             )
         return tuple(gaps.tolist())
 
@@ -149,8 +141,8 @@ def estimated(initial: str | Sequence[str] | None, motions: Sequence[Motion]) ->
         first = [np.concatenate([m.velocity, m.omega], axis=-1) for m in motions]
         initial = "given" if all(np.isfinite(v).all() for v in first) else "velocities"
     if isinstance(initial, str):
-        return _INITIAL[checked_choice("initial", initial, list(_INITIAL))]
-    initial = checked_items("initial", initial, str)
+        return _INITIAL[checks.checked_choice("initial", initial, list(_INITIAL))]
+    initial = checks.checked_items("initial", initial, str)
     if wrong := [key for key in initial if key not in QUANTITIES]:
         raise ValueError(f"initial must list some of {list(QUANTITIES)}, got {wrong[0]!r}")
     return tuple(key for key in QUANTITIES if key in initial)
@@ -170,11 +162,11 @@ def deviations(
     if noise is None:
         poses = _of_poses(scene, motions)
         return {**poses, "q": 1e-3} if joints else poses
-    checked_kind("noise", noise, Mapping, hint="; such as {'position': 0.001} [m]")
+    checks.checked_kind("noise", noise, Mapping, hint="; such as {'position': 0.001} [m]")
     for key, value in noise.items():
         if key not in _NOISE:
             raise ValueError(f"noise must be given for some of {list(_NOISE)}, got {key!r}")
-        checked_number(f"noise of {key}", value, above=0)
+        checks.checked_number(f"noise of {key}", value, above=0)
     if not noise:
         raise ValueError(f"noise must be given for at least one of {list(_NOISE)}, got none")
     if joints and "q" not in noise:

@@ -52,7 +52,7 @@ _PLACES, _LOOKS = 11, 64
 
 
 @runtime_checkable
-class Smoothed(Protocol):
+class SmoothedLoss(Protocol):
     """A least squares problem whose slopes may be those of planes through draws."""
 
     smoothing: Smoothing | None
@@ -110,7 +110,7 @@ class _Point(NamedTuple):
 
 
 def settled(
-    problem: Smoothed, solution: Solution, first: tuple[np.ndarray, Any], *, rough: bool = False
+    problem: SmoothedLoss, solution: Solution, first: tuple[np.ndarray, Any], *, rough: bool = False
 ) -> Solution:
     """The solution, or that of the trend if the loss is rough there; `problem.smoothing` says which.
 
@@ -130,7 +130,7 @@ def settled(
         return solution._replace(stop=Stop.INTERRUPTED)
 
 
-def _settled(problem: Smoothed, solution: Solution, first: _Point, rough: bool) -> Solution:
+def _settled(problem: SmoothedLoss, solution: Solution, first: _Point, rough: bool) -> Solution:
     widest = np.concatenate([_ranges(problem, solution.x), problem.start_widths()])
     rows = _directions(len(widest), problem.seed)
     here = _Point(solution.x, solution.blocks)
@@ -166,11 +166,11 @@ def _blind(solution: Solution, sight: _Sight) -> bool:
     return bool(np.any(curved < _LITTLE * seen))
 
 
-def _loss(problem: Smoothed, point: _Point) -> float:
+def _loss(problem: SmoothedLoss, point: _Point) -> float:
     return _seen(problem, point).normal.loss
 
 
-def _grown(problem: Smoothed, point: _Point, widest: np.ndarray) -> _Point:
+def _grown(problem: SmoothedLoss, point: _Point, widest: np.ndarray) -> _Point:
     """A point from which the beginning of motions is right, and more and more of them."""
     for share in _BEGINNINGS:
         problem.count(share)
@@ -180,7 +180,7 @@ def _grown(problem: Smoothed, point: _Point, widest: np.ndarray) -> _Point:
     return point
 
 
-def _looked(problem: Smoothed, point: _Point) -> _Point:
+def _looked(problem: SmoothedLoss, point: _Point) -> _Point:
     """The point with the values of bounded parameters that fit best, of many all over their bounds.
 
     A walk that meets an impact with a wrong restitution finds other motions that fit a little.
@@ -229,7 +229,7 @@ class _End(NamedTuple):
     steady: bool  # Whether the walk had come to rest but for that scatter
 
 
-def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
+def _averaged(problem: SmoothedLoss, point: _Point, widest: np.ndarray) -> _End:
     """Walk to the minimum of the trend and about it, and take the middle of the points that fit."""
     point = _descended(_walk(problem, point, widest), point)
     seen = _last_of(_walk(problem, point, widest))
@@ -254,7 +254,7 @@ def _averaged(problem: Smoothed, point: _Point, widest: np.ndarray) -> _End:
     return _End(held, sight, scatter, steady)
 
 
-def _fitting(problem: Smoothed, end: _End, first: _Point, widest: np.ndarray) -> _End:
+def _fitting(problem: SmoothedLoss, end: _End, first: _Point, widest: np.ndarray) -> _End:
     """The end, or that of a walk with other draws where its residuals are not those of the stated noise.
 
     Which motion a walk follows through the first impacts is up to its draws.
@@ -272,7 +272,7 @@ def _fitting(problem: Smoothed, end: _End, first: _Point, widest: np.ndarray) ->
     return end
 
 
-def _most(problem: Smoothed) -> float:
+def _most(problem: SmoothedLoss) -> float:
     """Loss beyond which residuals are not those of the stated noise."""
     return 0.5 * (problem.freedom + _UNLIKELY * np.sqrt(2 * problem.freedom))
 
@@ -297,7 +297,7 @@ def _drift(points: np.ndarray) -> np.ndarray:
     return np.abs(points[:half].mean(axis=0) - points[half:].mean(axis=0))
 
 
-def _walk(problem: Smoothed, point: _Point, widest: np.ndarray) -> Iterator[tuple[_Point, _Sight]]:
+def _walk(problem: SmoothedLoss, point: _Point, widest: np.ndarray) -> Iterator[tuple[_Point, _Sight]]:
     """Points of Gauss–Newton steps by slopes over visible steps, each with draws of its own."""
     seed = problem.seed
     problem.smoothing = _evenly(problem, _directions(len(widest), seed), widest, point)
@@ -317,7 +317,7 @@ def _walk(problem: Smoothed, point: _Point, widest: np.ndarray) -> Iterator[tupl
 
 
 def _shorter(
-    problem: Smoothed, point: _Point, normal: NormalEquations, widest: np.ndarray
+    problem: SmoothedLoss, point: _Point, normal: NormalEquations, widest: np.ndarray
 ) -> Iterator[_Point]:
     """Where the step to the minimum of the model leads, then halves of it."""
     longest = _LONGEST * widest[: len(point.x)]
@@ -330,7 +330,7 @@ def _shorter(
         yield _Point(x, problem.retract(point.blocks, share * block_change))
 
 
-def ripple_covariance(problem: Smoothed, x: np.ndarray, blocks: Any) -> np.ndarray:
+def ripple_covariance(problem: SmoothedLoss, x: np.ndarray, blocks: Any) -> np.ndarray:
     """Covariance that ripples of the residuals give the parameters, shape (p, p); zero without smoothing.
 
     What was observed has ripples of its own: it is as uncertain as where a walk about the minimum is.
@@ -343,7 +343,7 @@ def ripple_covariance(problem: Smoothed, x: np.ndarray, blocks: Any) -> np.ndarr
     return moves.T @ moves / len(moves) + problem.roughness
 
 
-def worth_of(problem: Smoothed, solution: Solution) -> Check:
+def worth_of(problem: SmoothedLoss, solution: Solution) -> Check:
     """What derivatives of the loss are worth where a search ended.
 
     Looked at is the way to the minimum of the model that derivatives make, initial states included, over one
@@ -379,7 +379,7 @@ def worth_of(problem: Smoothed, solution: Solution) -> Check:
     return found
 
 
-def _displacements(problem: Smoothed, found: Linearized) -> np.ndarray:
+def _displacements(problem: SmoothedLoss, found: Linearized) -> np.ndarray:
     """By how much each ripple alone moves the parameters, initial states following, shape (draws, p)."""
     _, hessian = eliminated(problem.assembled(found))
     inverse = np.linalg.pinv(hessian, rcond=1e-10, hermitian=True)
@@ -390,7 +390,7 @@ def _displacements(problem: Smoothed, found: Linearized) -> np.ndarray:
     return np.array(moves)
 
 
-def _seen(problem: Smoothed, point: _Point) -> _Sight:
+def _seen(problem: SmoothedLoss, point: _Point) -> _Sight:
     found = problem.simulate(point.x, point.blocks)
     normal = problem.assembled(found)
     gradient, hessian = eliminated(normal)
@@ -405,18 +405,18 @@ def _seen(problem: Smoothed, point: _Point) -> _Sight:
     return _Sight(found, normal, errors, away, float(np.max(scatter / scale, initial=0)))
 
 
-def _variance(problem: Smoothed, normal: NormalEquations) -> float:
+def _variance(problem: SmoothedLoss, normal: NormalEquations) -> float:
     """Of the residuals; what is far below the noise that was stated makes no difference."""
     return max(2 * normal.loss / max(problem.freedom, 1), problem.least_variance)
 
 
-def _evenly(problem: Smoothed, rows: np.ndarray, widest: np.ndarray, point: _Point) -> Smoothing:
+def _evenly(problem: SmoothedLoss, rows: np.ndarray, widest: np.ndarray, point: _Point) -> Smoothing:
     """The widest draws."""
     windows, unknowns = len(point.blocks.position), len(widest)
     return _smoothing(problem, rows, widest, np.tile(np.eye(unknowns), (windows, 1, 1)))
 
 
-def _drawn(rows: np.ndarray, widest: np.ndarray, sight: _Sight, problem: Smoothed) -> Smoothing:
+def _drawn(rows: np.ndarray, widest: np.ndarray, sight: _Sight, problem: SmoothedLoss) -> Smoothing:
     """Draws as likely as the data say, of parameters and a window's initial state together."""
     hessian, p = np.asarray(sight.found.hessian, float), len(sight.errors)
     own = hessian[:, :p, :p]
@@ -433,7 +433,7 @@ def _drawn(rows: np.ndarray, widest: np.ndarray, sight: _Sight, problem: Smoothe
     return _smoothing(problem, rows, widest, np.linalg.cholesky(covariance))
 
 
-def _smoothing(problem: Smoothed, rows: np.ndarray, widest: np.ndarray, unit: np.ndarray) -> Smoothing:
+def _smoothing(problem: SmoothedLoss, rows: np.ndarray, widest: np.ndarray, unit: np.ndarray) -> Smoothing:
     """Draws by spreads in units of the widest; what has no width stays where it is and has no slope."""
     free = widest > 0
     back = np.where(free, 1 / np.where(free, widest, 1), 0)
@@ -441,7 +441,7 @@ def _smoothing(problem: Smoothed, rows: np.ndarray, widest: np.ndarray, unit: np
     return Smoothing(*(jnp.asarray(part) for part in parts))
 
 
-def _ranges(problem: Smoothed, x: np.ndarray) -> np.ndarray:
+def _ranges(problem: SmoothedLoss, x: np.ndarray) -> np.ndarray:
     width = problem.upper - problem.lower
     return _WIDEST * np.where(np.isfinite(width), width, np.maximum(np.abs(x), 1e-3))
 

@@ -18,8 +18,8 @@ from dano.maths import Numbers
 from dano.mujoco._direct import Direct, direct
 from dano.mujoco._model import carry, carry_compiled, concerns, library, names_of, without_callback
 from dano.mujoco._settings import is_gap_beyond, Writer
-from dano.mujoco._table import body_index, Chooser, MOST, Table
-from dano.mujoco._things import checked_thing, Thing
+from dano.mujoco._table import body_index, BridgeTable, Chooser, MOST
+from dano.mujoco._things import AttachedObject, checked_thing
 from dano.mujoco._worlds import warp_device, warp_library
 from dano.names import did_you_mean
 from dano.objects import NeuralObject
@@ -72,8 +72,8 @@ class Bridge:
             is_gap_beyond(mujoco)
         self._most = checked_count("most", most, least=2)
         self._choose = choose
-        self._things: dict[str, Thing] = {}
-        self._tables: dict[int, tuple[Any, Table | None]] = {}
+        self._things: dict[str, AttachedObject] = {}
+        self._tables: dict[int, tuple[Any, BridgeTable | None]] = {}
         self._local = threading.local()
         self._before: Any = None
         self._direct: Direct | None = None
@@ -277,7 +277,7 @@ class Bridge:
         """In a step [m]."""
         return _LONGEST_FALL * min(thing.size for thing in self._things.values())
 
-    def _table(self, model: Any) -> Table | None:
+    def _table(self, model: Any) -> BridgeTable | None:
         """What is known of a model; None if it was not made by a bridge."""
         found = self._tables.get(id(model))
         if found is None or found[0]() is not model:
@@ -286,11 +286,11 @@ class Bridge:
             self._tables[id(model)] = found = weakref.ref(model), self._looked_up(model)
         return found[1]
 
-    def _looked_up(self, model: Any) -> Table | None:
+    def _looked_up(self, model: Any) -> BridgeTable | None:
         ours = any(concerns(model, name) for name in self._things)
         return self._checked(model) if ours else None
 
-    def _checked(self, model: Any) -> Table:
+    def _checked(self, model: Any) -> BridgeTable:
         mujoco = self._mujoco
         if model.opt.enableflags & int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)):
             raise ValueError(
@@ -305,7 +305,7 @@ class Bridge:
                 "model.opt.disableflags must not switch off springs and dampers: MuJoCo then skips the "
                 "callback by which objects get their contacts"
             )
-        return Table(mujoco, model, self._things, self._choose, self._most)
+        return BridgeTable(mujoco, model, self._things, self._choose, self._most)
 
     def _check_timestep(self, model: Any) -> None:
         h, g = model.opt.timestep, model.opt.gravity

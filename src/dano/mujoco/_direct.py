@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from dano.mujoco._search import CALLBACK, CALLBACK_FEATURES, Search
+from dano.mujoco._search import CALLBACK, CALLBACK_FEATURES, NearSearch
 from dano.mujoco._settings import Writer
 from dano.mujoco.kernels.words import Entry, Head, SHIFT
 from dano.native import cpu_kernel, Launch, Parameters
@@ -127,12 +127,12 @@ class Direct:
                 self._head[Head.PYTHON] = now
                 self._slot.value = self._address
 
-    def knows(self, data: Any, search: Search) -> bool:
+    def knows(self, data: Any, search: NearSearch) -> bool:
         """Whether data are known, with that search."""
         found = self._entries.get(data._address)
         return found is not None and found.data() is data and found.search is search
 
-    def add(self, model: Any, data: Any, search: Search, geoms: Collection[int], fall: float) -> None:
+    def add(self, model: Any, data: Any, search: NearSearch, geoms: Collection[int], fall: float) -> None:
         """Know data from now on.
 
         Args:
@@ -233,7 +233,7 @@ class _Known(NamedTuple):
     entry: Int[np.ndarray, " words"]
     model: "weakref.ref[Any]"
     data: "weakref.ref[Any]"
-    search: Search
+    search: NearSearch
     kept: tuple[Any, ...]
 
 

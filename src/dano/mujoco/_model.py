@@ -8,7 +8,7 @@ import numpy as np
 from dano.exchange import solid_triangles
 from dano.extras import optional
 from dano.fields import convex_hull
-from dano.mujoco._things import Thing
+from dano.mujoco._things import AttachedObject
 from dano.objects import NeuralObject
 
 _MARK = "dano:"
@@ -41,7 +41,7 @@ def names_of(target: Any, spec: bool) -> list[str]:
     return [target.body(i).name for i in range(target.nbody)]
 
 
-def carry(mujoco: Any, spec: Any, name: str, thing: Thing, look: NeuralObject | None) -> None:
+def carry(mujoco: Any, spec: Any, name: str, thing: AttachedObject, look: NeuralObject | None) -> None:
     """Give a body of a spec an object's mass and a stand-in, take its geoms out of contact, show it."""
     body = next(body for body in spec.bodies if body.name == name)
     mesh, hull = None, convex_hull(thing.surface.points)[0]
@@ -78,7 +78,7 @@ def standin_name(body: str) -> str:
     return f"{_MARK}{body}:hull"
 
 
-def carry_compiled(mujoco: Any, model: Any, body: int, name: str, thing: Thing) -> None:
+def carry_compiled(mujoco: Any, model: Any, body: int, name: str, thing: AttachedObject) -> None:
     """Give a body of a compiled model an object's mass, and take its geoms out of contact.
 
     Raises:

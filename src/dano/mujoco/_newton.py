@@ -9,8 +9,8 @@ import numpy as np
 from dano.checks import checked_count
 from dano.maths import Numbers
 from dano.mujoco._model import library
-from dano.mujoco._table import body_index, MOST, Table
-from dano.mujoco._things import checked_thing, Thing
+from dano.mujoco._table import body_index, BridgeTable, MOST
+from dano.mujoco._things import AttachedObject, checked_thing
 from dano.mujoco._worlds import Worlds
 from dano.names import did_you_mean
 from dano.objects import NeuralObject
@@ -94,7 +94,7 @@ class NewtonBridge:
             raise ValueError(f"solver must have no flexes beside objects, got {solver.mj_model.nflex}")
         self._solver, self._most = solver, checked_count("most", most, least=2)
         self._mujoco = library()
-        self._things: dict[str, Thing] = {}
+        self._things: dict[str, AttachedObject] = {}
 
     def attach(
         self,
@@ -131,7 +131,7 @@ class NewtonBridge:
         geom = int(model.body_geomadr[index])
         bits = int(model.geom_contype[geom]), int(model.geom_conaffinity[geom])
         things = {**self._things, body: checked_thing(obj, position, orientation, bits)}
-        table = Table(self._mujoco, model, things, None, self._most)
+        table = BridgeTable(self._mujoco, model, things, None, self._most)
         worlds: Worlds = table.in_worlds(model, str(self._solver.device))
         worlds.hide(sorted(table.geoms), model.ngeom)
         self._solver.mjw_model.callback.contactfilter = worlds

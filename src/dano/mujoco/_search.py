@@ -7,9 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dano.mujoco._settings import is_gap_beyond, Settings
-from dano.mujoco._solids import Geom, object_solid, Solid
-from dano.mujoco._surfaces import Surface
-from dano.mujoco._things import Thing
+from dano.mujoco._things import AttachedObject, Geom, object_solid, Solid, Surface
 from dano.mujoco.kernels import words
 from dano.mujoco.kernels.words import REALS, WHOLES
 from dano.native import (
@@ -43,23 +41,14 @@ Those of a ball turn to what is nearest; with several feet on it, that is one af
 
 
 class Part(NamedTuple):
-    """A geom or an object.
+    """A geom or an object."""
 
-    Attributes:
-        body: Body that it moves with.
-        geom: Geom that it is, or that stands for the object.
-        solid: Its solid.
-        surface: Samples that press on others; None for none.
-        scale: Factors of samples on the unit ball [m].
-        thing: The object, None for a geom.
-    """
-
-    body: int
-    geom: int
-    solid: Solid
-    surface: Surface | None
-    scale: Float[np.ndarray, "3"]
-    thing: Thing | None
+    body: int  # Body that it moves with
+    geom: int  # Geom that it is, or that stands for the object
+    solid: Solid  # Its solid
+    surface: Surface | None  # Samples that press on others; None for none
+    scale: Float[np.ndarray, "3"]  # Factors of samples on the unit ball [m]
+    thing: AttachedObject | None  # The object, None for a geom
 
 
 def kernel_builds() -> list[tuple[Features, str]]:
@@ -72,12 +61,12 @@ def part_of_geom(body: int, geom: int, found: Geom) -> Part:
     return Part(body, geom, found.solid, found.surface, found.scale, None)
 
 
-def part_of_thing(body: int, geom: int, thing: Thing) -> Part:
+def part_of_thing(body: int, geom: int, thing: AttachedObject) -> Part:
     """An object."""
     return Part(body, geom, object_solid(thing.obj), thing.surface, np.ones(3), thing)
 
 
-class Known:
+class BridgeModel:
     """Arrays of `dano.mujoco.kernels.tables.Known` of a model, and what their kernels must know."""
 
     def __init__(
@@ -273,10 +262,10 @@ def _parts(like: Parameters, parts: Sequence[Part], at: Sequence[int]):
     return numbers, index
 
 
-class Search:
+class NearSearch:
     """The search in some data of a model: a launch with its arrays, and what it found."""
 
-    def __init__(self, mujoco: Any, model: Any, data: Any, known: Known, most: int):
+    def __init__(self, mujoco: Any, model: Any, data: Any, known: BridgeModel, most: int):
         """`most`: contacts of a pair."""
         n = len(known.pairs)
         self.rows, self.wholes = np.zeros((most * n, REALS)), np.zeros((most * n, WHOLES), np.int32)

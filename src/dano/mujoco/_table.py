@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from dano.mujoco._model import standin_name
-from dano.mujoco._search import Known, Part, part_of_geom, part_of_thing, Search
+from dano.mujoco._search import BridgeModel, NearSearch, Part, part_of_geom, part_of_thing
 from dano.mujoco._settings import overriding, Settings
-from dano.mujoco._solids import geom_of
-from dano.mujoco._things import Thing
+from dano.mujoco._things import AttachedObject, geom_of
 from dano.mujoco._worlds import Worlds
 
 MOST = 8
@@ -21,16 +20,16 @@ Chooser = Callable[[Any, int, int], Settings | None]
 """From a model and two of its geoms to the parameters of their contacts; None if they do not touch."""
 
 
-class Carrier(NamedTuple):
+class CarrierRow(NamedTuple):
     """A body with an object."""
 
     body: int  # Its index
     geom: int  # The geom that stands for the object in MuJoCo's list of contacts
-    thing: Thing  # The object
+    thing: AttachedObject  # The object
     others: Int[np.ndarray, " k"]  # Geoms that it may touch, by the tree of bodies
 
 
-class Table:
+class BridgeTable:
     """What the search needs of a model. Frictions, heights and the like are read in every step.
 
     So are sizes of geoms: where one has changed, what is known of them is made anew.
@@ -40,7 +39,7 @@ class Table:
         self,
         mujoco: Any,
         model: Any,
-        things: Mapping[str, Thing],
+        things: Mapping[str, AttachedObject],
         choose: Chooser | None = None,
         most: int = MOST,
     ):
@@ -53,7 +52,7 @@ class Table:
         bodies = {name: body_index(model, name) for name in things}
         taken = np.isin(model.geom_bodyid, list(bodies.values()))
         self.carriers = [
-            Carrier(body, _geom_of(model, body, name), things[name], _others(mujoco, model, body, taken))
+            CarrierRow(body, _geom_of(model, body, name), things[name], _others(mujoco, model, body, taken))
             for name, body in bodies.items()
         ]
         self.geoms = frozenset(carrier.geom for carrier in self.carriers)
@@ -62,10 +61,10 @@ class Table:
         }
         self._collide = True
         self._known = self._look(model)
-        self._searches: dict[int, tuple[Any, Known, Search]] = {}
+        self._searches: dict[int, tuple[Any, BridgeModel, NearSearch]] = {}
 
-    def _look(self, model: Any, device: str | None = None) -> Known:
-        """The parts of the model, and which of them may touch; `device` as `Known` has it."""
+    def _look(self, model: Any, device: str | None = None) -> BridgeModel:
+        """The parts of the model, and which of them may touch; `device` as `BridgeModel` has it."""
         parts: list[Part] = [part_of_thing(each.body, each.geom, each.thing) for each in self.carriers]
         at: dict[int, int] = {}
         pairs = []
@@ -79,7 +78,7 @@ class Table:
             for j, other in enumerate(self.carriers[i + 1 :], i + 1):
                 if _may_meet(self._mujoco, model, carrier.body, other.body):
                     pairs.append((i, j))
-        return Known(parts, np.array(pairs, np.int32).reshape(-1, 2), model.geom_size, device)
+        return BridgeModel(parts, np.array(pairs, np.int32).reshape(-1, 2), model.geom_size, device)
 
     def stand_in(self, model: Any, collides: bool) -> bool:
         """Let the hulls that stand in for objects collide, or not; whether that changed."""
@@ -107,7 +106,7 @@ class Table:
             given = [self._choose(model, a, b) for a, b in ends]
         return Worlds(known, self._most, given)
 
-    def find(self, model: Any, data: Any) -> tuple[int, Search]:
+    def find(self, model: Any, data: Any) -> tuple[int, NearSearch]:
         """All contacts of the objects at the present pose: how many, and where they are.
 
         Raises:
@@ -134,16 +133,16 @@ class Table:
         self._known = self._look(model)
         return self.find(model, data)
 
-    def search_in(self, data: Any) -> Search | None:
+    def search_in(self, data: Any) -> NearSearch | None:
         """The search that has been made for some data, if it still is the one."""
         found = self._searches.get(id(data))
         return found[2] if found is not None and found[0]() is data and found[1] is self._known else None
 
-    def _search(self, model: Any, data: Any) -> Search:
+    def _search(self, model: Any, data: Any) -> NearSearch:
         key, known, found = id(data), self._known, self.search_in(data)
         if found is None:
             gone = weakref.ref(data, lambda _: self._searches.pop(key, None))
-            found = Search(self._mujoco, model, data, known, self._most)
+            found = NearSearch(self._mujoco, model, data, known, self._most)
             self._searches[key] = gone, known, found
         return found
 
@@ -163,7 +162,7 @@ def _standin(model: Any, name: str) -> int | None:
         return None
 
 
-def _unknown(model: Any, known: Known, geom: int) -> str:
+def _unknown(model: Any, known: BridgeModel, geom: int) -> str:
     error = next(part.solid.error for part in known.parts if part.geom == geom)
     return (
         f"geom {model.geom(geom).name or geom!r} must be a plane, height field, sphere, capsule, ellipsoid, "

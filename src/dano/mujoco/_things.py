@@ -1,23 +1,379 @@
-"""A neural object as the search for contacts wants it: arrays in the frame of its MuJoCo body."""
+"""A neural object as the search for contacts wants it: arrays in the frame of its MuJoCo body.
 
+Samples of surfaces in blocks, and an order of them that is spread evenly: what contacts are merged by.
+Geoms and objects as what they press on and what they press with, for the kernels that find contacts.
+Flat faces of an object as planes: near their edges its sampled distance is rounded, a plane is exact.
+"""
+
+import functools
 import os
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from dano.maths import checked_array, Numbers, quat_to_matrix
-from dano.mujoco._faces import Faces, faces_of
-from dano.mujoco._surfaces import Surface, surface_of
-from dano.objects import NeuralObject
+from dano import fields, maths, objects
+from dano.contact import SurfaceSet
 from dano.scene_file import load_object
+
+_BLOCK = 16
+"""Samples of a block, see `SurfaceSet`."""
+_RUN = 8
+"""Blocks of a run."""
+_IN_BLOCK = 4
+"""Levels of the tree within a block."""
+_LEVELS = 24
+"""Of the tree of halves."""
+_WITHIN = 0x555555
+"""Which of two halves comes first, by level: in turn the first and the second, so that the first sample of a
+cell lies within it, not at its corner."""
+_TURNING = {"fixed": 0, "axis": 1, "ball": 2}
+"""How samples turn with their body, as in `dano.physics.pairs`."""
+_ALONG = 8
+"""Parts of the largest extent of a hull between its samples (as many as boxes have, about)."""
+
+
+class Surface(NamedTuple):
+    """Samples of a surface."""
+
+    points: Float[np.ndarray, "n 3"]  # [m], or directions on the unit ball, shape (n, 3)
+    # Vector areas [m²], zero where the last block is filled up, shape (n, 3).
+    vectors: Float[np.ndarray, "n 3"]
+    # Root of their number over the place in an order that begins evenly spread, shape (n,).
+    precedence: Float[np.ndarray, " n"]
+    balls: Float[np.ndarray, "b 4"]  # Centre and radius [m] of a ball around each block, shape (n / 16, 4)
+    runs: Float[np.ndarray, "r 4"]  # The same around each run of eight blocks
+    turning: int = 0  # How samples turn, a number
+
+    def moved(self, rotation: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"]) -> "Surface":
+        """The same in another frame."""
+
+        def moved(balls):
+            return np.concatenate([balls[:, :3] @ rotation.T + origin, balls[:, 3:]], axis=1)
+
+        return self._replace(
+            points=self.points @ rotation.T + origin,
+            vectors=self.vectors @ rotation.T,
+            balls=moved(self.balls),
+            runs=moved(self.runs),
+        )
+
+
+def surface_of(points, vectors, turning: str = "fixed") -> Surface:
+    """A surface by samples [m] with vector areas [m²]; `turning` as in `SurfaceSet`."""
+    blocks = SurfaceSet.create(points, vectors, turning)
+    x, a, centers = (
+        np.asarray(part, np.float64) for part in (blocks.points[:3].T, blocks.vectors.T, blocks.centers)
+    )
+    of_blocks, order = _tree(centers, _LEVELS - _IN_BLOCK)
+    rows, codes = [], []
+    for block in order:
+        own = np.arange(block * _BLOCK, (block + 1) * _BLOCK)
+        places, inner = _tree(x[own], _IN_BLOCK)
+        rows.append(own[inner])
+        codes.append((of_blocks[block] << _IN_BLOCK) + places[inner])
+    row = np.concatenate(rows)
+    balls = np.concatenate([centers, np.asarray(blocks.radii, np.float64)[:, None]], axis=1)
+    balls = balls[order]
+    runs = np.array([_around(balls[k : k + _RUN]) for k in range(0, len(balls), _RUN)])
+    return Surface(x[row], a[row], _precedence(np.concatenate(codes)), balls, runs, _TURNING[turning])
+
+
+def _precedence(codes: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """By codes of a tree of halves read backwards: each half has every other place, and so on within it."""
+    codes = codes ^ _WITHIN
+    backwards = sum(((codes >> k) & 1) << (_LEVELS - 1 - k) for k in range(_LEVELS))
+    place = np.argsort(np.argsort(backwards, kind="stable"), kind="stable")
+    return np.sqrt(len(codes) / (1.0 + place))
+
+
+def _around(balls: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "4"]:
+    """A ball around balls."""
+    lower, upper = (balls[:, :3] - balls[:, 3:]).min(axis=0), (balls[:, :3] + balls[:, 3:]).max(axis=0)
+    middle = 0.5 * (lower + upper)
+    return np.append(middle, (np.linalg.norm(balls[:, :3] - middle, axis=1) + balls[:, 3]).max())
+
+
+def _tree(x: Float[np.ndarray, "n 3"], levels: int) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Codes of points by halving the longest extent, first half first, and the order in which they ascend."""
+    codes = np.zeros(len(x), np.int64)
+    parts = [(np.arange(len(x)), levels)]
+    while parts:
+        index, level = parts.pop()
+        if len(index) < 2 or level == 0:
+            continue
+        axis = int(np.argmax(np.ptp(x[index], axis=0)))
+        index = index[np.argsort(x[index, axis], kind="stable")]
+        half = (len(index) + 1) // 2
+        codes[index[half:]] += 1 << (level - 1)
+        parts += [(index[:half], level - 1), (index[half:], level - 1)]
+    return codes, np.argsort(codes, kind="stable")
+
+
+def hull_surface(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], normals: Float[np.ndarray, "f 3"]
+) -> Surface:
+    """Corners of a convex hull, and points on its faces; each has a third of its triangles."""
+    spacing = float(np.ptp(vertices, axis=0).max()) / _ALONG
+    points, vectors = [], []
+    for face, normal in zip(faces, normals, strict=True):
+        a, b, c = vertices[face]
+        longest = max(np.linalg.norm(b - a), np.linalg.norm(c - b), np.linalg.norm(a - c))
+        n = max(1, int(np.ceil(longest / spacing)))
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a)) / n**2
+        u, v = (k.ravel() for k in np.mgrid[: n + 1, : n + 1])
+        inside = u + v <= n
+        u, v = u[inside], v[inside]
+        # Corners of small triangles that meet there: six inside, three along an edge, one at a corner.
+        edges = (u == 0).astype(int) + (v == 0) + (u + v == n)
+        points.append(a + (u / n)[:, None] * (b - a) + (v / n)[:, None] * (c - a))
+        vectors.append((area / 3 * np.array([6, 3, 1])[edges])[:, None] * normal)
+    x, areas = np.concatenate(points), np.concatenate(vectors)
+    _, first, same = np.unique(np.round(x / spacing, 6), axis=0, return_index=True, return_inverse=True)
+    total = np.zeros((len(first), 3))
+    np.add.at(total, same.ravel(), areas)
+    return surface_of(x[first], total)
+
+
+_FAR = 1e30
+"""Thickness of what has no other side [m]."""
+
+
+class Solid(NamedTuple):
+    """What samples of others press on, in a frame of its own."""
+
+    kind: str  # Name of a kind in `dano.physics.solids.distances` or `dano.mujoco.kernels.solids`
+    sizes: Float[np.ndarray, "3"] = np.zeros(3)  # As `dano.physics.solids.distances.Leaf` has them [m]
+    thickness: float = _FAR  # Half of what is to be gone through at the thickest place [m]
+    spacing: Float[np.ndarray, "3"] = np.zeros(3)  # Between the nodes of a grid [m]
+    coefficients: Float[np.ndarray, "nx ny nz"] | None = None  # Of the spline of a grid [m]
+    degree: int = 0  # Of the spline
+    # Unit outward normal and offset [m] of the faces of a hull, shape (f, 4).
+    planes: Float[np.ndarray, "f 4"] | None = None
+    field: int = 0  # Of a height field, its number
+    bend: float = 0.0  # Least radius of curvature of a shape without edges, 0 for others [m]
+    error: str = ""  # Why a geom may not touch an object
+
+
+class Geom(NamedTuple):
+    """A geom: its solid, its surface unless it has no end, and the factors of directions on the unit ball."""
+
+    solid: Solid
+    surface: Surface | None
+    scale: Float[np.ndarray, "3"] = np.ones(3)
+
+
+def object_solid(obj: objects.NeuralObject) -> Solid:
+    """The solid of an object, in its field frame; of kind `NONE` where it is made of samples."""
+    if obj.solid is None:
+        return Solid("NONE")
+    grid = obj.solid
+    return Solid(
+        kind="GRID",
+        sizes=np.asarray(grid.origin, np.float64),
+        spacing=np.broadcast_to(np.asarray(grid.spacing, np.float64), (3,)),
+        coefficients=np.asarray(grid.coefficients, np.float64),
+        degree=fields.degree_of(grid.interpolation),
+    )
+
+
+def geom_of(mujoco: Any, model: Any, geom: int) -> Geom:
+    """A geom with its present size."""
+    kind, size, types = model.geom_type[geom], model.geom_size[geom].tolist(), mujoco.mjtGeom
+    data = int(model.geom_dataid[geom])
+    match kind:
+        case types.mjGEOM_PLANE:
+            return Geom(Solid("HALF_SPACE", np.array([0.0, 0.0, 1.0])), None)
+        case types.mjGEOM_SPHERE:
+            return _shape("SPHERE", fields.Sphere, size[0])
+        case types.mjGEOM_CAPSULE:
+            return _shape("CAPSULE", fields.Capsule, *size[:2])
+        case types.mjGEOM_CYLINDER:
+            return _shape("CYLINDER", fields.Cylinder, *size[:2])
+        case types.mjGEOM_ELLIPSOID:
+            return _shape("ELLIPSOID", fields.Ellipsoid, tuple(size))
+        case types.mjGEOM_BOX:
+            return _shape("BOX", fields.Box, tuple(size))
+        case types.mjGEOM_MESH:
+            first, count = model.mesh_vertadr[data], model.mesh_vertnum[data]
+            return _hull(np.array(model.mesh_vert[first : first + count], np.float64))
+        case types.mjGEOM_HFIELD:
+            return Geom(Solid("HEIGHTS", field=data), None)
+    return Geom(Solid("UNKNOWN", error=f"got type {types(int(kind)).name}"), None)
+
+
+@functools.lru_cache(maxsize=256)
+def _shape(kind: str, make: type[fields.AbstractShape], *size: Any) -> Geom:
+    shape = make(*size)
+    surface = surface_of(*objects.surface_quadrature(shape))
+    sizes = np.zeros(3)
+    flat = np.ravel(size)
+    sizes[: len(flat)] = flat
+    thickness = float(flat.min()) if kind != "CAPSULE" else float(flat[0])
+    scale = np.ones(3)
+    if surface.turning == 2:
+        scale = np.broadcast_to(sizes, (3,)) if kind == "ELLIPSOID" else np.full(3, sizes[0])
+    bends = {"SPHERE": flat[0], "CAPSULE": flat[0], "ELLIPSOID": flat.min() ** 2 / flat.max()}
+    return Geom(Solid(kind, sizes, thickness, bend=float(bends.get(kind, 0.0))), surface, scale)
+
+
+def _hull(vertices: Float[np.ndarray, "v 3"]) -> Geom:
+    """The convex hull of the vertices of a mesh, which is what MuJoCo collides."""
+    # Here, not above: `import dano` would take a fifth of a second longer.
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(vertices)
+    except QhullError:
+        return Geom(Solid("UNKNOWN", error="got a mesh whose vertices lie in a plane"), None)
+    # Triangles of one flat face have the same plane.
+    _, first = np.unique(np.round(hull.equations, 9), axis=0, return_index=True)
+    planes = hull.equations[first]
+    middle = vertices[hull.vertices].mean(axis=0)
+    thickness = -float((planes[:, :3] @ middle + planes[:, 3]).max())
+    surface = hull_surface(vertices, hull.simplices, hull.equations[:, :3])
+    return Geom(Solid("HULL", thickness=thickness, planes=planes), surface)
+
+
+_CONVEX = 1.1
+"""Area of the convex hull of a face over that of its samples, at most: others have holes or bays, or are two
+faces on one plane, and are left to the grid."""
+_CORNER = 0.02
+"""How far corners of a face may be from a straight edge that takes their place, in cells."""
+_BAND, _THIN = 2.0, 0.5
+"""How far from its plane a face says the distance: in cells, and of half the thickness at most."""
+_SLACK = 0.1
+"""How much further than the plane the sampled distance may be, in cells: what flat regions scatter by."""
+_ALONG_FACES = np.cos(np.radians(5.0))
+"""Least cosine between the vector area of a sample within a face and its normal."""
+_EXACT = 2e-3
+"""How far from its plane a sample of a face is, in cells."""
+
+
+class GeomFace(NamedTuple):
+    """A convex flat face."""
+
+    plane: Float[np.ndarray, "4"]  # Unit outward normal, and minus the offset [m]
+    edges: Float[np.ndarray, "k 4"]  # The same of planes through its edges, normal to the face
+
+
+class Faces(NamedTuple):
+    """Flat faces of an object, in a frame."""
+
+    faces: list[GeomFace]
+    planes: Float[np.ndarray, "f 4"]  # Of all flat faces, those that are not convex, too
+    cell: float  # Of the object's grid [m]
+
+    def band(self, thickness: float) -> float:
+        """Distance from a plane within which its face counts [m], for an object of a half thickness [m]."""
+        return min(_BAND * self.cell, _THIN * thickness) if self.faces else 0.0
+
+    @property
+    def slack(self) -> float:
+        """How much less than the sampled distance that of a face may be [m]."""
+        return _SLACK * self.cell if self.faces else 0.0
+
+    def moved(self, rotation: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"]) -> "Faces":
+        """The same in another frame."""
+        return self._replace(
+            faces=[
+                GeomFace(_moved(f.plane, rotation, origin), _moved(f.edges, rotation, origin))
+                for f in self.faces
+            ],
+            planes=_moved(self.planes, rotation, origin),
+        )
+
+    def around(
+        self, points: Float[np.ndarray, "n 3"], vectors: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+        """Normal of the face that each sample lies within, zero for others, and which lie on edges of faces.
+
+        Args:
+            points: Samples [m].
+            vectors: Their vector areas [m²].
+        """
+        found = np.zeros((len(points), 3))
+        areas = np.linalg.norm(vectors, axis=1)
+        on = np.abs(points @ self.planes[:, :3].T + self.planes[:, 3]) < _EXACT * self.cell
+        along = vectors @ self.planes[:, :3].T > _ALONG_FACES * areas[:, None]
+        within = on & along & (on.sum(axis=1, keepdims=True) == 1) & (areas[:, None] > 0)
+        rows, columns = np.nonzero(within)
+        found[rows] = self.planes[columns, :3]
+        return found, on.any(axis=1) & ~within.any(axis=1)
+
+
+def faces_of(obj: objects.NeuralObject) -> Faces:
+    """The flat faces of an object, in its field frame."""
+    solid = obj.solid
+    if not isinstance(solid, fields.SignedDistanceGrid):
+        return Faces([], np.zeros((0, 4)), 0.0)
+    cell = float(np.max(np.asarray(solid.spacing)))
+    points, areas = np.asarray(obj.surface.points, np.float64), np.asarray(obj.surface.areas, np.float64)
+    vectors = np.asarray(obj.surface.vectors, np.float64)
+    found, planes = [], []
+    for normal, offset, members in objects.flat_faces(obj.surface, solid.spacing):
+        plane = np.append(normal, -offset)
+        planes.append(plane)
+        # What edges and corners stand for looks elsewhere in part.
+        facing = np.clip(vectors[members] @ normal, 0.0, areas[members]).sum()
+        edges = _edges(points[members], normal, float(facing), _CORNER * cell)
+        if edges is not None:
+            found.append(GeomFace(plane, edges))
+    return Faces(found, np.array(planes).reshape(-1, 4), cell)
+
+
+def _edges(
+    points: Float[np.ndarray, "m 3"], normal: Float[np.ndarray, "3"], area: float, corner: float
+) -> Float[np.ndarray, "k 4"] | None:
+    """Planes through the edges of the hull of points on a plane; None where they do not fill it."""
+    # Here, not above: `import dano` would take a fifth of a second longer.
+    from scipy.spatial import ConvexHull, QhullError
+
+    axes = np.linalg.svd(normal[None])[2][1:]
+    flat = points @ axes.T
+    try:
+        hull = ConvexHull(flat)
+    except QhullError:
+        return None
+    if hull.volume > _CONVEX * area:
+        return None
+    ring = _simplified(flat[hull.vertices], corner)
+    along = np.roll(ring, -1, axis=0) - ring
+    # Corners go around against the clock.
+    outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    offsets = np.einsum("ij,ij->i", outward, ring)
+    return np.column_stack([outward @ axes, -offsets])
+
+
+def _simplified(ring: Float[np.ndarray, "c 2"], near: float) -> Float[np.ndarray, "k 2"]:
+    """A convex ring without the corners that lie near the line between their neighbours."""
+    while len(ring) > 3:
+        before, after = np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0)
+        along = after - before
+        arm = ring - before
+        away = np.abs(along[:, 0] * arm[:, 1] - along[:, 1] * arm[:, 0]) / np.linalg.norm(along, axis=1)
+        least = int(np.argmin(away))
+        if away[least] > near:
+            return ring
+        ring = np.delete(ring, least, axis=0)
+    return ring
+
+
+def _moved(
+    planes: Float[np.ndarray, "*k 4"], rotation: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "*k 4"]:
+    """Planes in another frame."""
+    normals = planes[..., :3] @ rotation.T
+    return np.concatenate([normals, planes[..., 3:] - (normals @ origin)[..., None]], axis=-1)
 
 
 @dataclass(frozen=True)
-class Thing:
+class AttachedObject:
     """An object on a body."""
 
-    obj: NeuralObject  # The object
+    obj: objects.NeuralObject  # The object
     surface: Surface  # Its samples, in the body frame
     faces: Faces  # Its flat faces, in the body frame
     middle: Float[np.ndarray, "3"]  # Centre of a ball around all samples [m]
@@ -33,11 +389,11 @@ class Thing:
 
 
 def checked_thing(
-    obj: NeuralObject | str | os.PathLike[str],
-    position: Numbers,
-    orientation: Numbers,
+    obj: objects.NeuralObject | str | os.PathLike[str],
+    position: maths.Numbers,
+    orientation: maths.Numbers,
     bits: tuple[int, int],
-) -> Thing:
+) -> AttachedObject:
     """What `thing_of` makes of the arguments of an `attach`.
 
     Raises:
@@ -45,23 +401,23 @@ def checked_thing(
     """
     if isinstance(obj, str | os.PathLike):
         obj = load_object(obj)
-    if not isinstance(obj, NeuralObject):
+    if not isinstance(obj, objects.NeuralObject):
         raise ValueError(f"obj must be a NeuralObject or the path of one, got {type(obj).__name__}")
-    place = np.asarray(checked_array("position", position, (3,)), np.float64)
-    turn = np.asarray(checked_array("orientation", orientation, (4,)), np.float64)
+    place = np.asarray(maths.checked_array("position", position, (3,)), np.float64)
+    turn = np.asarray(maths.checked_array("orientation", orientation, (4,)), np.float64)
     if not np.linalg.norm(turn) > 0:
         raise ValueError(f"orientation must not be zero, got {turn.tolist()}")
     return thing_of(obj, place, turn / np.linalg.norm(turn), bits)
 
 
 def thing_of(
-    obj: NeuralObject,
+    obj: objects.NeuralObject,
     position: Float[np.ndarray, "3"],
     orientation: Float[np.ndarray, "4"],
     bits: tuple[int, int],
-) -> Thing:
-    """An object whose field frame has a pose in the frame of its body; `bits`: see `Thing`."""
-    rotation = np.asarray(quat_to_matrix(orientation), np.float64)
+) -> AttachedObject:
+    """An object whose field frame has a pose in the frame of its body; `bits`: see `AttachedObject`."""
+    rotation = np.asarray(maths.quat_to_matrix(orientation), np.float64)
     surface = surface_of(obj.surface.points, obj.surface.vectors).moved(rotation, position)
     lower, upper = surface.points.min(axis=0), surface.points.max(axis=0)
     middle = 0.5 * (lower + upper)
@@ -69,7 +425,7 @@ def thing_of(
     thickness = 0.5 * float((upper - lower).min())
     if obj.solid is not None:
         thickness = min(thickness, -float(np.min(np.asarray(obj.solid.distances))))
-    return Thing(
+    return AttachedObject(
         obj=obj,
         surface=surface,
         faces=faces_of(obj).moved(rotation, position),

@@ -2,16 +2,7 @@
 
 import numpy as np
 
-from dano.fields import (
-    AbstractField,
-    AbstractShape,
-    density_at,
-    distance_at,
-    GridField,
-    jet_at,
-    SignedDistanceGrid,
-    spread_distances,
-)
+from dano import fields
 from dano.objects._samples import Lattice, Region
 
 MARGIN = 4
@@ -21,7 +12,9 @@ BAND = 5
 """Nodes within this many cells of the surface get the distance to their own closest point."""
 
 
-def field_solid(field: AbstractField, grid: GridField, level: float, *, floaters: bool) -> SignedDistanceGrid:
+def field_solid(
+    field: fields.AbstractField, grid: fields.GridField, level: float, *, floaters: bool
+) -> fields.SignedDistanceGrid:
     """The solid of a field: by a shape's own signed distance, or by the level set of its grid.
 
     Args:
@@ -31,15 +24,15 @@ def field_solid(field: AbstractField, grid: GridField, level: float, *, floaters
         level: Density of the surface.
         floaters: Whether to keep parts that are not connected to the largest one.
     """
-    if isinstance(field, SignedDistanceGrid):
+    if isinstance(field, fields.SignedDistanceGrid):
         stored = _stored(np.asarray(field.distances))
-        solid = SignedDistanceGrid(stored, field.origin, field.spacing, field.interpolation)
-    elif isinstance(field, AbstractShape):
+        solid = fields.SignedDistanceGrid(stored, field.origin, field.spacing, field.interpolation)
+    elif isinstance(field, fields.AbstractShape):
         origin, spacing, nodes = _nodes(grid, MARGIN)
-        distances = distance_at(field, nodes.reshape(-1, 3))
+        distances = fields.distance_at(field, nodes.reshape(-1, 3))
         if distances.min() >= 0:  # thinner than a cell
             return level_set(grid, level, floaters=floaters)
-        solid = SignedDistanceGrid(_stored(distances.reshape(nodes.shape[:3])), origin, spacing)
+        solid = fields.SignedDistanceGrid(_stored(distances.reshape(nodes.shape[:3])), origin, spacing)
     else:
         return level_set(grid, level, floaters=floaters)
     inside = np.asarray(solid.distances) <= 0
@@ -49,7 +42,7 @@ def field_solid(field: AbstractField, grid: GridField, level: float, *, floaters
     return solid
 
 
-def level_set(grid: GridField, level: float, *, floaters: bool) -> SignedDistanceGrid:
+def level_set(grid: fields.GridField, level: float, *, floaters: bool) -> fields.SignedDistanceGrid:
     """Signed distance of a level set of a density grid, floaters removed and enclosed cavities filled.
 
     Nodes within five cells of the surface get the distance to their closest point of the level set of the
@@ -66,7 +59,7 @@ def level_set(grid: GridField, level: float, *, floaters: bool) -> SignedDistanc
 
     # Two more, because the density reaches that far beyond its outermost nodes.
     origin, spacing, nodes = _nodes(grid, MARGIN + 2)
-    values = density_at(grid, nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
+    values = fields.density_at(grid, nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
     level = level if np.any(values >= level) else 0.5 * float(values.max())
     region = Region.create(Lattice(values, origin, spacing), level, floaters=floaters)
     inside = region.occupied | region.cavity
@@ -80,8 +73,8 @@ def level_set(grid: GridField, level: float, *, floaters: bool) -> SignedDistanc
     near = ndimage.distance_transform_edt(~boundary) <= BAND - 1
     points = origin + spacing * np.argwhere(near)
     closest = _closest(grid, level, points, cloud[cKDTree(cloud).query(points)[1]])
-    distances, _ = spread_distances(near, closest, origin, spacing)
-    return SignedDistanceGrid(_stored(np.where(inside, -distances, distances)), origin, spacing)
+    distances, _ = fields.spread_distances(near, closest, origin, spacing)
+    return fields.SignedDistanceGrid(_stored(np.where(inside, -distances, distances)), origin, spacing)
 
 
 def _stored(distances: np.ndarray) -> np.ndarray:
@@ -89,11 +82,11 @@ def _stored(distances: np.ndarray) -> np.ndarray:
     return distances.astype(np.float32).astype(np.float64)
 
 
-def _frame(grid: GridField | SignedDistanceGrid) -> tuple[np.ndarray, np.ndarray]:
+def _frame(grid: fields.GridField | fields.SignedDistanceGrid) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(grid.origin, dtype=np.float64), np.asarray(grid.spacing, dtype=np.float64)
 
 
-def _nodes(grid: GridField, margin: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _nodes(grid: fields.GridField, margin: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Origin (3,), spacing (3,) and nodes (nx, ny, nz, 3) [m] of a grid with some more on every side."""
     origin, spacing = _frame(grid)
     origin = origin - margin * spacing
@@ -102,7 +95,7 @@ def _nodes(grid: GridField, margin: int) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _crossings(
-    grid: GridField, level: float, inside: np.ndarray, values: np.ndarray, origin: np.ndarray
+    grid: fields.GridField, level: float, inside: np.ndarray, values: np.ndarray, origin: np.ndarray
 ) -> np.ndarray:
     """Where the edges between nodes inside and outside meet the level set [m], shape (m, 3)."""
     spacing = np.asarray(grid.spacing, dtype=np.float64)
@@ -119,7 +112,7 @@ def _crossings(
     share = above / (above - below)
     low, high = np.zeros(len(start)), np.ones(len(start))
     for _ in range(8):
-        value, gradient = jet_at(grid, start + share[:, None] * way)
+        value, gradient = fields.jet_at(grid, start + share[:, None] * way)
         above = value >= level
         low, high = np.where(above, share, low), np.where(above, high, share)
         slope = np.einsum("ij,ij->i", gradient, way)
@@ -128,13 +121,13 @@ def _crossings(
     return start + share[:, None] * way
 
 
-def _closest(grid: GridField, level: float, points: np.ndarray, start: np.ndarray) -> np.ndarray:
+def _closest(grid: fields.GridField, level: float, points: np.ndarray, start: np.ndarray) -> np.ndarray:
     """The point of the level set closest to each of `points`, searched from points `start` on it (m, 3)."""
     tolerance = 1e-3 * float(np.min(np.asarray(grid.spacing)))
     closest, distance = start.copy(), np.linalg.norm(points - start, axis=1)
     foot, outward = start, None
     for _ in range(6):
-        value, gradient = jet_at(grid, foot)
+        value, gradient = fields.jet_at(grid, foot)
         outward = gradient if outward is None else outward
         slope = np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(np.float32).tiny)
         here = np.linalg.norm(points - foot, axis=1)

@@ -15,9 +15,8 @@ from dano.planning._plan import (
     Plan as Plan,
     plan as plan,
 )
-from dano.planning._problem import problem_of as problem_of
+from dano.planning._problem import gradual as gradual, problem_of as problem_of, softened as softened
 from dano.planning._sampling import FIRST_DRAWS as FIRST_DRAWS, SamplingOptions as SamplingOptions
-from dano.planning._softening import gradual as gradual, softened as softened
 from dano.planning._task import (
     Actuator as Actuator,
     Goal as Goal,

@@ -14,29 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano import checks, solvers
 from dano.archive import read_archive, write_archive
-from dano.checks import (
-    checked_choice,
-    checked_function,
-    checked_kind,
-    checked_optional,
-)
 from dano.engine import AbstractEngine, checked_engine, compiler_options, simulate
 from dano.gradients import Check, check
 from dano.maths import checked_array
 from dano.planning._exploring import explored, to_touch
 from dano.planning._options import PlanOptions
-from dano.planning._problem import problem_of, Scales, VIOLATION
+from dano.planning._problem import gradual, problem_of, Scales, softened, VIOLATION
 from dano.planning._sampling import costs, rated, sampled
-from dano.planning._softening import gradual, softened
 from dano.planning._task import Limit, Task
 from dano.scene import Control, Scene, State, state_arrays, Trajectory
-from dano.solvers import (
-    optimal_trajectory,
-    TrajectoryProblem,
-    TrajectorySolution,
-    TrajectoryStop,
-)
 
 # Searches for contact, each with other random numbers, until a plan meets what is required.
 _ATTEMPTS = 3
@@ -44,7 +32,7 @@ _ATTEMPTS = 3
 _GRADUAL = 0.02
 # By so much giving up contact costs more than the controls that make it.
 _DEARER = 10.0
-_ENDED = (TrajectoryStop.STOPPED, TrajectoryStop.TIME)
+_ENDED = (solvers.TrajectoryStop.STOPPED, solvers.TrajectoryStop.TIME)
 
 Method = Literal["ilqr", "cem", "mppi"]
 METHODS = ("ilqr", "cem", "mppi")
@@ -108,7 +96,7 @@ class Plan:
     method: str
     seconds: float
     distances: dict[str, np.ndarray]
-    solution: TrajectorySolution | None = None
+    solution: solvers.TrajectorySolution | None = None
     explored: str = ""
 
     def describe(self) -> str:
@@ -214,14 +202,14 @@ def plan(
         ValueError: If the task does not fit the scene, a method is unknown, or a shape is wrong.
     """
     began = time.perf_counter()
-    checked_kind("scene", scene, Scene)
+    checks.checked_kind("scene", scene, Scene)
     scene.check_state(state)
-    checked_kind("task", task, Task).check(scene)
-    checked_choice("method", method, METHODS)
-    checked_optional("warm", warm, Plan)
-    options = checked_optional("options", options, PlanOptions) or PlanOptions()
+    checks.checked_kind("task", task, Task).check(scene)
+    checks.checked_choice("method", method, METHODS)
+    checks.checked_optional("warm", warm, Plan)
+    options = checks.checked_optional("options", options, PlanOptions) or PlanOptions()
     if callback is not None:
-        checked_function("callback", callback)
+        checks.checked_function("callback", callback)
     engine, state = checked_engine(engine), scene.filled(state)
     scales = Scales.of(task)
     guess = scales.scaled(_first_guess(task, controls, warm))
@@ -250,10 +238,10 @@ def plan(
     if options.explore is None:
         why, solution = _explored(given, problem, guess, scales)
     solution = solution or given.optimised(guess)
-    if solution.stop is TrajectoryStop.INFEASIBLE:
+    if solution.stop is solvers.TrajectoryStop.INFEASIBLE:
         solution = _pushed(given, solution)
     message = solution.stop.value
-    if solution.stop is TrajectoryStop.INFEASIBLE:
+    if solution.stop is solvers.TrajectoryStop.INFEASIBLE:
         message += f"{_what_is_missed(solution)}; {_worth(given, problem, solution).summary}"
     made = _plan(scene, state, task, scales, engine, solution.controls, solution, message, method, began)
     return dataclasses.replace(made, explored=why)
@@ -270,7 +258,7 @@ class _Given(NamedTuple):
     options: PlanOptions
     tell: Callable[[str, int, float], object]
 
-    def optimised(self, guess: Array, penalty: float = 0.0) -> TrajectorySolution:
+    def optimised(self, guess: Array, penalty: float = 0.0) -> solvers.TrajectorySolution:
         """The best trajectory near that of a guess; `penalty` is the least one to begin with."""
         multipliers = None
         if self.warm is not None and self.warm.solution is not None:
@@ -284,7 +272,7 @@ class _Given(NamedTuple):
         for name, stage in (*stages, ("optimising", self.scene)):
             limit = ilqr.max_seconds
             left = None if limit is None else max(0.0, limit - (time.perf_counter() - began))
-            solution = optimal_trajectory(
+            solution = solvers.optimal_trajectory(
                 problem_of(stage, self.task, self.engine),
                 self.state,
                 guess,
@@ -294,24 +282,24 @@ class _Given(NamedTuple):
                 compiler_options=compiler_options(),
             )
             guess, multipliers = solution.controls, solution.multipliers
-            if solution.stop is TrajectoryStop.STOPPED:
+            if solution.stop is solvers.TrajectoryStop.STOPPED:
                 break
         assert solution is not None
         return solution
 
 
-def _pushed(given: _Given, solution: TrajectorySolution) -> TrajectorySolution:
+def _pushed(given: _Given, solution: solvers.TrajectorySolution) -> solvers.TrajectorySolution:
     """The solution, or one that meets the constraints once friction is gradual in derivatives."""
     scene = gradual(given.scene, _GRADUAL)
     if scene is given.scene:
         return solution
     found = given._replace(scene=scene, warm=None).optimised(solution.controls)
-    return solution if found.stop is TrajectoryStop.INFEASIBLE else found
+    return solution if found.stop is solvers.TrajectoryStop.INFEASIBLE else found
 
 
 def _explored(
-    given: _Given, problem: TrajectoryProblem, guess: Array, scales: Scales
-) -> tuple[str, TrajectorySolution | None]:
+    given: _Given, problem: solvers.TrajectoryProblem, guess: Array, scales: Scales
+) -> tuple[str, solvers.TrajectorySolution | None]:
     """Why contact was looked for and the trajectory that came of it; nothing if the guess makes contact."""
     scene, task = given.scene, given.task
     values = scales.physical(guess)
@@ -337,7 +325,7 @@ def _explored(
     return f"{why}: paths that lead to contact were looked for first", best
 
 
-def _worth(given: _Given, problem: TrajectoryProblem, solution: TrajectorySolution) -> Check:
+def _worth(given: _Given, problem: solvers.TrajectoryProblem, solution: solvers.TrajectorySolution) -> Check:
     """What derivatives of the priced cost are worth at the end, each control moved at all times alike."""
     w, rate = jnp.asarray(solution.controls), 0.5 * solution.penalty
 
@@ -355,7 +343,7 @@ def _worth(given: _Given, problem: TrajectoryProblem, solution: TrajectorySoluti
     )
 
 
-def _dear(problem: TrajectoryProblem, state: State, guess: Array, found: Array) -> float:
+def _dear(problem: solvers.TrajectoryProblem, state: State, guess: Array, found: Array) -> float:
     """Penalty with which giving up what was found for the first guess costs more than all its controls.
 
     With less, iLQR first saves controls: contact is lost, and nothing leads back to it.
@@ -364,7 +352,7 @@ def _dear(problem: TrajectoryProblem, state: State, guess: Array, found: Array) 
     return _DEARER * float(cost[0]) / (0.5 * max(float(violation[0]), VIOLATION**2))
 
 
-def _violation(solution: TrajectorySolution) -> float:
+def _violation(solution: solvers.TrajectorySolution) -> float:
     return max((violation.amount for violation in solution.violations), default=0.0)
 
 
@@ -376,7 +364,7 @@ def _first_guess(task: Task, controls: Any, warm: Plan | None) -> Array:
     return checked_array("controls", controls, shape)
 
 
-def _what_is_missed(solution: TrajectorySolution) -> str:
+def _what_is_missed(solution: solvers.TrajectorySolution) -> str:
     missed = [v.name for v in solution.violations if v.amount > VIOLATION]
     return f"; not met: {', '.join(missed)}" if missed else ""
 

@@ -2,6 +2,8 @@
 
 Controls of the problem are shares of their bounds' half-widths, u = middle + width w, so that all are of
 order one. Costs of rates are multiplied by the timestep: a plan is the same at half the step.
+
+Softer contact and gradual friction, with which a plan is found more easily.
 """
 
 import dataclasses
@@ -13,10 +15,61 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from dano.checks import checked_number
+from dano.contact import DistributedLaw
 from dano.engine import AbstractEngine, difference, retract
 from dano.planning._task import Goal, Limit, Task
 from dano.scene import Scene, State
 from dano.solvers import TrajectoryConstraint, TrajectoryProblem
+
+_STIFF = ("stiffness", "spring", "damper")
+
+
+def softened(scene: Scene, factor: float) -> Scene:
+    """The scene with softer contacts: bodies sink deeper into each other, and forces change less abruptly.
+
+    Args:
+        scene: The scene.
+        factor: What the stiffness (distributed law), or spring and damper (centroid law), is multiplied with.
+
+    Raises:
+        ValueError: If the factor is not positive.
+    """
+    checked_number("factor", factor, above=0)
+
+    def params_of(scene: Scene) -> list:
+        every = [contact.params for contact in _contacts(scene)]
+        return [x for params in every for name in _STIFF if (x := getattr(params, name)) is not None]
+
+    return eqx.tree_at(params_of, scene, [factor * x for x in params_of(scene)])
+
+
+def gradual(scene: Scene, slip: float) -> Scene:
+    """The scene with friction that grows with the slip in derivatives; its motion is the same.
+
+    What sticks does not move however one pushes, so that derivatives do not say where a stronger push leads.
+
+    Args:
+        scene: The scene.
+        slip: v_g, see `DistributedLaw.gradual_stiction` [m/s]. Other laws stay as they are.
+
+    Raises:
+        ValueError: If the slip is not positive.
+    """
+    checked_number("slip", slip, above=0)
+
+    def laws_of(scene: Scene) -> list:
+        every = [contact.law for contact in _contacts(scene)]
+        return [law.gradual_stiction for law in every if isinstance(law, DistributedLaw)]
+
+    found = laws_of(scene)
+    return eqx.tree_at(laws_of, scene, [jnp.full_like(x, slip) for x in found]) if found else scene
+
+
+def _contacts(scene: Scene) -> list:
+    """All that have parameters and a law: the contacts, and what lets other pairs touch."""
+    return [*scene.contacts, *([] if scene.others is None else [scene.others])]
+
 
 VIOLATION = 1e-3
 """The solver's violation of a goal that is missed by `Goal.within`."""
@@ -171,7 +224,7 @@ class Reached(eqx.Module):
         return self.goal.error(self.scene, state) * (VIOLATION / self.goal.within)
 
 
-class Kept(eqx.Module):
+class KeptRollout(eqx.Module):
     """A limit as a constraint of every step."""
 
     scene: Scene
@@ -203,7 +256,7 @@ def problem_of(
         for goal in task.goals
         if goal.required
     ]
-    constraints += [TrajectoryConstraint(limit.name, Kept(scene, limit)) for limit in task.limits]
+    constraints += [TrajectoryConstraint(limit.name, KeptRollout(scene, limit)) for limit in task.limits]
     stage, final = StageCost(scene, task, scales, left, substeps), FinalCost(scene, task)
     return TrajectoryProblem(
         Dynamics(scene, task, scales, engine, prepared, left, substeps),

@@ -8,17 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dano.checks import checked_choice, checked_count, checked_items, checked_text, shown
-from dano.maths import (
-    checked_array,
-    checked_numbers,
-    checked_quaternion,
-    is_traced,
-    Numbers,
-    quat_conjugate,
-    quat_log,
-    quat_multiply,
-)
+from dano import checks, maths
 from dano.names import did_you_mean
 from dano.scene import Control, Scene, State
 
@@ -54,11 +44,11 @@ class Actuator(eqx.Module):
         body: str,
         kind: str = "force",
         *,
-        limit: Numbers | None = None,
-        lower: Numbers | None = None,
-        upper: Numbers | None = None,
+        limit: maths.Numbers | None = None,
+        lower: maths.Numbers | None = None,
+        upper: maths.Numbers | None = None,
         axes: str = _AXES,
-        cost: Numbers = 1e-4,
+        cost: maths.Numbers = 1e-4,
     ):
         """See the class.
 
@@ -75,31 +65,32 @@ class Actuator(eqx.Module):
             ValueError: If the kind or an axis is unknown, the bounds are missing, not finite or crossed, or
                 the cost is negative.
         """
-        checked_text("body", body)
-        checked_choice(f"kind of the actuator of {body!r}", kind, list(KINDS))
+        checks.checked_text("body", body)
+        checks.checked_choice(f"kind of the actuator of {body!r}", kind, list(KINDS))
         self.body, self.kind = body, kind
         self.axes = "" if KINDS[kind] == 1 else _checked_axes(axes, f"the {kind} of {body!r}")
         what = f"of the {kind} of {body!r}"
         if limit is not None:
             if lower is not None or upper is not None:
                 raise ValueError(f"limit {what} must stand alone, got lower or upper besides it")
-            upper = checked_numbers(f"limit {what}", limit)
+            upper = maths.checked_numbers(f"limit {what}", limit)
             lower = -upper
             if not 1 <= upper.size <= max(1, len(self.axes)) or not np.all(np.isfinite(upper) & (upper > 0)):
                 raise ValueError(
-                    f"limit {what} must be finite and > 0, one number or one per axis, got {shown(limit)}"
+                    f"limit {what} must be finite and > 0, one number or one per axis, got"
+                    f" {checks.shown(limit)}"
                 )
         if lower is None or upper is None:
             raise ValueError(f"bounds {what} must be given: limit, or lower and upper")
         n = max(1, len(self.axes))
         self.lower = _spread(f"lower {what}", lower, n)
         self.upper = _spread(f"upper {what}", upper, n)
-        if not is_traced(self.lower, self.upper) and not np.all(np.asarray(self.lower < self.upper)):
+        if not maths.is_traced(self.lower, self.upper) and not np.all(np.asarray(self.lower < self.upper)):
             raise ValueError(
                 f"lower {what} must be < upper, got {np.asarray(self.lower).tolist()} and "
                 f"{np.asarray(self.upper).tolist()}: no control lies between them"
             )
-        self.cost = checked_array(f"cost {what}", cost, (), least=0.0)
+        self.cost = maths.checked_array(f"cost {what}", cost, (), least=0.0)
 
     @property
     def size(self) -> int:
@@ -142,12 +133,12 @@ class Goal(eqx.Module):
         self,
         body: str,
         *,
-        running: Numbers = 0.0,
-        final: Numbers = 0.0,
+        running: maths.Numbers = 0.0,
+        final: maths.Numbers = 0.0,
         required: bool = True,
-        within: Numbers = 1e-3,
+        within: maths.Numbers = 1e-3,
         axes: str = _AXES,
-        **value: Numbers,
+        **value: maths.Numbers,
     ):
         """A goal such as ``Goal("bunny", position=(1, 0, 0.3), within=0.01)``.
 
@@ -164,7 +155,7 @@ class Goal(eqx.Module):
             ValueError: If not exactly one quantity is given, it is unknown, a shape is wrong, or a weight is
                 negative or `within` not positive.
         """
-        checked_text("body", body)
+        checks.checked_text("body", body)
         if len(value) != 1:
             raise ValueError(
                 f"goal of {body!r} must have one of {', '.join(QUANTITIES)}, got {list(value) or 'none'}"
@@ -175,7 +166,7 @@ class Goal(eqx.Module):
         self.required = bool(required)
         for name, number in (("running", running), ("final", final), ("within", within)):
             bound = {"above": 0.0} if name == "within" else {"least": 0.0}
-            setattr(self, name, checked_array(f"{name} of the goal of {body!r}", number, (), **bound))
+            setattr(self, name, maths.checked_array(f"{name} of the goal of {body!r}", number, (), **bound))
 
     @property
     def name(self) -> str:
@@ -217,8 +208,8 @@ class Limit(eqx.Module):
         body: str,
         quantity: str,
         *,
-        lower: Numbers = -np.inf,
-        upper: Numbers = np.inf,
+        lower: maths.Numbers = -np.inf,
+        upper: maths.Numbers = np.inf,
         axes: str = _AXES,
     ):
         """See the class.
@@ -226,18 +217,19 @@ class Limit(eqx.Module):
         Raises:
             ValueError: If the quantity is unknown, or bounds are NaN or crossed.
         """
-        checked_text("body", body)
+        checks.checked_text("body", body)
         valid = [name for name in QUANTITIES if name != "orientation"]
-        checked_choice(f"quantity of the limit of {body!r}", quantity, valid)
+        checks.checked_choice(f"quantity of the limit of {body!r}", quantity, valid)
         self.body, self.quantity = body, quantity
         self.axes = _AXES if QUANTITIES[quantity] == 1 else _checked_axes(axes, f"the limit of {body!r}")
         n = 1 if QUANTITIES[quantity] == 1 else len(self.axes)
         bounds = []
         for side, given in (("lower", lower), ("upper", upper)):
-            bound = checked_numbers(f"{side} of the limit of {body!r}", given)
+            bound = maths.checked_numbers(f"{side} of the limit of {body!r}", given)
             if bound.shape not in ((), (n,)) or np.any(np.isnan(bound)):
                 raise ValueError(
-                    f"{side} of the limit of {body!r} must be one number or {n}, not NaN, got {shown(given)}"
+                    f"{side} of the limit of {body!r} must be one number or {n}, not NaN, got"
+                    f" {checks.shown(given)}"
                 )
             bounds.append(bound)
         self.lower, self.upper = (jnp.asarray(np.broadcast_to(b, (n,))) for b in bounds)
@@ -287,9 +279,12 @@ class Task(eqx.Module):
         Raises:
             ValueError: If there is no step, no actuator or no goal, or two actuators drive the same.
         """
-        self.n_steps = checked_count("n_steps", n_steps)
-        self.actuators = checked_items("actuators", actuators, Actuator)
-        self.goals, self.limits = checked_items("goals", goals, Goal), checked_items("limits", limits, Limit)
+        self.n_steps = checks.checked_count("n_steps", n_steps)
+        self.actuators = checks.checked_items("actuators", actuators, Actuator)
+        self.goals, self.limits = (
+            checks.checked_items("goals", goals, Goal),
+            checks.checked_items("limits", limits, Limit),
+        )
         if not self.actuators or not self.goals:
             raise ValueError("task must have at least one actuator and one goal")
         driven = [(a.body, a.kind, axis) for a in self.actuators for axis in a.axes or "q"]
@@ -374,7 +369,7 @@ def _difference(scene: Scene, state: State, body: str, quantity: str, value: Arr
         place = layout.coordinates[joint]
         return numbers[place : place + 1] - value
     if quantity == "orientation":
-        error = quat_log(quat_multiply(quat_conjugate(value), state.orientation[i]))
+        error = maths.quat_log(maths.quat_multiply(maths.quat_conjugate(value), state.orientation[i]))
     else:
         error = getattr(state, quantity)[i] - value
     return error if axes == _AXES else error[np.array([_AXES.index(axis) for axis in axes])]
@@ -390,20 +385,20 @@ def _checked_axes(axes: str, what: str) -> str:
     return axes
 
 
-def _checked_value(quantity: str, value: Numbers, what: str) -> Array:
+def _checked_value(quantity: str, value: maths.Numbers, what: str) -> Array:
     if quantity not in QUANTITIES:
         raise ValueError(
             f"quantity {what} must be one of {', '.join(QUANTITIES)}, got {quantity!r}"
             + did_you_mean(quantity, QUANTITIES)
         )
     if quantity == "orientation":
-        return checked_quaternion(f"orientation {what}", value)
+        return maths.checked_quaternion(f"orientation {what}", value)
     shape = () if QUANTITIES[quantity] == 1 else (QUANTITIES[quantity],)
-    return jnp.atleast_1d(checked_array(f"{quantity} {what}", value, shape))
+    return jnp.atleast_1d(maths.checked_array(f"{quantity} {what}", value, shape))
 
 
-def _spread(name: str, value: Numbers, n: int) -> Array:
-    array = checked_numbers(name, value)
+def _spread(name: str, value: maths.Numbers, n: int) -> Array:
+    array = maths.checked_numbers(name, value)
     if array.shape not in ((), (n,)):
         raise ValueError(f"{name} must be one number or {n}, got shape {array.shape}")
-    return checked_array(name, np.broadcast_to(array, (n,)), (n,))
+    return maths.checked_array(name, np.broadcast_to(array, (n,)), (n,))

@@ -15,11 +15,8 @@ from dano.checks import checked_count, checked_items, checked_kind
 from dano.identification import Identification, Motion
 from dano.maths import quat_rotate
 from dano.pixels import draw_frames, FilmFit
-from dano.report._framing import camera_for
-from dano.report._overlay import side_by_side
 from dano.report._page import check_page, image, png, table, video, warnings, write_page
-from dano.report._resample import frame_times, poses_at
-from dano.report._stage import stage
+from dano.report._stage import camera_for, frame_times, poses_at, side_by_side, stage
 from dano.report._tracking import draw_tracked, encoded, enlarged, WIDTH
 from dano.report._video import encoder, require
 from dano.scene import Scene, State, Trajectory

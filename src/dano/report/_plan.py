@@ -9,8 +9,7 @@ from dano.archive import checked_output, replacing
 from dano.checks import checked_kind
 from dano.planning import Plan, Task
 from dano.progress import Progress
-from dano.report._resample import frame_times
-from dano.report._stage import Stage, stage
+from dano.report._stage import frame_times, PictureStage, stage
 from dano.report._video import check_film, checked_video, film, require, take_of, VideoOptions
 from dano.scene import Scene
 from dano.vision import Item, LearnedField
@@ -58,7 +57,7 @@ def film_plan(
     film([take._replace(ghosts=_ghosts(scene, task, plan, drawn))], options, outputs, progress)
 
 
-def _ghosts(scene: Scene, task: Task, plan: Plan, drawn: Stage) -> list[Item]:
+def _ghosts(scene: Scene, task: Task, plan: Plan, drawn: PictureStage) -> list[Item]:
     """The bodies that a goal places, where it wants them; what it leaves open is as at the plan's end."""
     position = np.array(plan.trajectory.states.position[-1], dtype=float)
     orientation = np.array(plan.trajectory.states.orientation[-1], dtype=float)
@@ -74,7 +73,7 @@ def _ghosts(scene: Scene, task: Task, plan: Plan, drawn: Stage) -> list[Item]:
             continue
         placed.add(row)
     shown = [i for i, row in enumerate(drawn.rows) if row in placed]
-    part = Stage(
+    part = PictureStage(
         [drawn.items[i] for i in shown], [drawn.rows[i] for i in shown], [drawn.offsets[i] for i in shown]
     )
     return part.posed(position, orientation)

@@ -11,25 +11,31 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from dano import checks, vision
 from dano.archive import checked_output, replacing
-from dano.checks import (
-    checked_choice,
-    checked_function,
-    checked_items,
-    checked_kind,
-    checked_number,
-    checked_optional,
-    checked_path,
-)
 from dano.extras import optional
 from dano.names import did_you_mean
 from dano.progress import Progress
-from dano.report._framing import CAMERAS, cameras_for, Seen, seen_of, together
-from dano.report._overlay import draw_clock, draw_label, draw_touches, side_by_side
-from dano.report._resample import frame_times, moments_of, poses_at
-from dano.report._stage import check_run, Stage, stage, Touches, touches
+from dano.report._stage import (
+    CAMERAS,
+    cameras_for,
+    check_run,
+    draw_clock,
+    draw_label,
+    draw_touches,
+    frame_times,
+    moments_of,
+    PictureStage,
+    poses_at,
+    Seen,
+    seen_of,
+    side_by_side,
+    stage,
+    together,
+    Touches,
+    touches,
+)
 from dano.scene import Scene, State, Trajectory
-from dano.vision import AbstractCamera, Camera, Item, LearnedField, prepare, render
 
 MOST_PIXELS = 8192
 """Longest side of a film: what common decoders of H.264 can show."""
@@ -68,7 +74,7 @@ class VideoOptions:
     fps: int = 30
     size: tuple[int, int] = (640, 400)
     slow_motion: int | float = 1.0
-    camera: AbstractCamera | str = "auto"
+    camera: vision.AbstractCamera | str = "auto"
     contact_points: bool = True
     clock: bool = True
     colours: Mapping[str, str] | None = None
@@ -80,14 +86,16 @@ class VideoOptions:
         Raises:
             ValueError: If a number is out of range, or the camera is unknown.
         """
-        checked_number("fps", self.fps, above=0)
-        checked_number("slow_motion", self.slow_motion, above=0)
+        checks.checked_number("fps", self.fps, above=0)
+        checks.checked_number("slow_motion", self.slow_motion, above=0)
         if isinstance(self.camera, str):
-            checked_choice("camera", self.camera, CAMERAS)
+            checks.checked_choice("camera", self.camera, CAMERAS)
         else:
-            checked_kind("camera", self.camera, AbstractCamera, hint=f", or one of {', '.join(CAMERAS)}")
+            checks.checked_kind(
+                "camera", self.camera, vision.AbstractCamera, hint=f", or one of {', '.join(CAMERAS)}"
+            )
         checked_size(self.pixels)
-        checked_optional("colours", self.colours, Mapping)
+        checks.checked_optional("colours", self.colours, Mapping)
 
     @property
     def pixels(self) -> tuple[int, int]:
@@ -106,13 +114,13 @@ class Take(NamedTuple):
     """A run as a film shows it: what is drawn of it, and where that is in each frame."""
 
     seen: Seen  # What the camera keeps in view
-    drawn: Stage  # Bodies
+    drawn: PictureStage  # Bodies
     times: Float[np.ndarray, " frames"]  # Of the frames [s]
     position: Float[np.ndarray, "frames bodies 3"]  # Of the centres of mass [m, W]
     orientation: Float[np.ndarray, "frames bodies 4"]  # Of the bodies
     touched: Touches | None  # Contacts; None if they are not drawn
     label: str = ""  # Written in a corner, if it is not empty
-    ghosts: Sequence[Item] = ()  # Drawn through, and over all
+    ghosts: Sequence[vision.Item] = ()  # Drawn through, and over all
 
 
 def render_trajectory(
@@ -121,7 +129,7 @@ def render_trajectory(
     path: str | os.PathLike[str] | None,
     *,
     strip: str | os.PathLike[str] | None = None,
-    looks: Mapping[str, LearnedField] | None = None,
+    looks: Mapping[str, vision.LearnedField] | None = None,
     options: VideoOptions | None = None,
     progress: Progress | None = None,
 ) -> None:
@@ -184,7 +192,7 @@ def render_start(
     state: State,
     path: str | os.PathLike[str],
     *,
-    looks: Mapping[str, LearnedField] | None = None,
+    looks: Mapping[str, vision.LearnedField] | None = None,
     size: tuple[int, int] = (640, 400),
 ) -> None:
     """Draw a scene at a state, for instance before its simulation.
@@ -201,7 +209,7 @@ def render_start(
             ending.
         ImportError: If pillow is missing.
     """
-    checked_kind("scene", scene, Scene).check_state(checked_kind("state", state, State))
+    checks.checked_kind("scene", scene, Scene).check_state(checks.checked_kind("state", state, State))
     output = checked_output(path)
     if output.suffix.lower() != ".png":
         raise ValueError(f"path must end in .png, got {output}")
@@ -211,8 +219,8 @@ def render_start(
     position, orientation = (np.asarray(x, np.float64) for x in (state.position, state.orientation))
     seen = seen_of(scene, drawn, position[None], orientation[None])
     camera = cameras_for(seen, 1.0, (width, height), "fixed")[0]
-    prepare(drawn.items, camera)
-    write_png(output, render(drawn.posed(position, orientation), camera, floor=False))
+    vision.prepare(drawn.items, camera)
+    write_png(output, vision.render(drawn.posed(position, orientation), camera, floor=False))
 
 
 def render_side_by_side(
@@ -222,7 +230,7 @@ def render_side_by_side(
     *,
     labels: Sequence[str] = ("", ""),
     strip: str | os.PathLike[str] | None = None,
-    looks: Sequence[Mapping[str, LearnedField] | None] = (None, None),
+    looks: Sequence[Mapping[str, vision.LearnedField] | None] = (None, None),
     options: VideoOptions | None = None,
     progress: Progress | None = None,
 ) -> None:
@@ -267,7 +275,7 @@ def _shared(options: VideoOptions, scenes: Sequence[Scene]) -> list[dict[str, st
 
 
 def _two(name: str, values: Any, *kinds: type) -> tuple[Any, ...]:
-    values = checked_items(name, values, *kinds)
+    values = checks.checked_items(name, values, *kinds)
     if len(values) != 2:
         raise ValueError(f"{name} must be two, for left and right, got {len(values)}")
     return values
@@ -279,7 +287,7 @@ def checked_video(options: VideoOptions | None, usual: VideoOptions | None = Non
     Raises:
         ValueError: If they are something else.
     """
-    return (checked_optional("options", options, VideoOptions) or usual or VideoOptions()).drafted()
+    return (checks.checked_optional("options", options, VideoOptions) or usual or VideoOptions()).drafted()
 
 
 def checked_size(size: Sequence[int], count: int = 1, name: str = "size") -> tuple[int, int]:
@@ -293,7 +301,7 @@ def checked_size(size: Sequence[int], count: int = 1, name: str = "size") -> tup
     Raises:
         ValueError: If they are not even numbers in range.
     """
-    size, most = checked_items(name, size, int), MOST_PIXELS if count == 1 else _MOST_OF_HALF
+    size, most = checks.checked_items(name, size, int), MOST_PIXELS if count == 1 else _MOST_OF_HALF
     if len(size) != 2 or not all(16 <= n <= most and n % 2 == 0 for n in size):
         raise ValueError(
             f"{name} must be two even numbers from 16 to {most} pixels (video codecs need them even),"
@@ -322,10 +330,10 @@ def check_film(
         check_run(scene, trajectory)
     checked_size(options.pixels, len(runs), "options.size")
     if progress is not None:
-        checked_function("progress", progress)
+        checks.checked_function("progress", progress)
     checked = []
     for name, output, suffix in (("path", path, ".mp4"), ("strip", strip, ".png")):
-        if output is not None and checked_path(name, output).suffix.lower() != suffix:
+        if output is not None and checks.checked_path(name, output).suffix.lower() != suffix:
             raise ValueError(f"{name} must end in {suffix}, got {output}")
         checked.append(None if output is None else checked_output(output))
     if path is not None:
@@ -334,7 +342,9 @@ def check_film(
     return checked[0], checked[1]
 
 
-def take_of(scene: Scene, trajectory: Trajectory, drawn: Stage, count: int, options: VideoOptions) -> Take:
+def take_of(
+    scene: Scene, trajectory: Trajectory, drawn: PictureStage, count: int, options: VideoOptions
+) -> Take:
     """A run at the times of so many frames; after its end it stands still."""
     since = np.arange(count) / (options.fps * options.slow_motion)
     known = np.asarray(trajectory.times, dtype=np.float64)
@@ -370,7 +380,7 @@ def film(
     else:
         cameras = [options.camera] * count
     if count > 1:
-        prepare([item for take in takes for item in take.drawn.items], cameras[0])
+        vision.prepare([item for take in takes for item in take.drawn.items], cameras[0])
     sizes = [item.radius for take in takes for item in take.drawn.items if item.plane is None]
     arrow = 0.55 * float(np.median(sizes or [1.0]))
     position = np.concatenate([take.position for take in takes], axis=1)
@@ -388,7 +398,7 @@ def film(
 
 
 def _painter(
-    take: Take, cameras: Sequence[AbstractCamera], whole: bool
+    take: Take, cameras: Sequence[vision.AbstractCamera], whole: bool
 ) -> Callable[[int], UInt8[np.ndarray, "height width 3"]]:
     """What draws the bodies of a run in a frame; frames in which nothing is seen to move are drawn once.
 
@@ -404,9 +414,9 @@ def _painter(
     def drawn(frame: int) -> UInt8[np.ndarray, "height width 3"]:
         items = take.drawn.posed(take.position[frame], take.orientation[frame])
         camera = cameras[frame]
-        image = render(items, camera, floor=False, antialias=whole, shadows=whole)
+        image = vision.render(items, camera, floor=False, antialias=whole, shadows=whole)
         if take.ghosts:
-            both = render([*items, *take.ghosts], camera, floor=False, antialias=whole, shadows=whole)
+            both = vision.render([*items, *take.ghosts], camera, floor=False, antialias=whole, shadows=whole)
             image = np.round((1 - _GHOST) * image + _GHOST * both.astype(float)).astype(np.uint8)
         return image
 
@@ -420,7 +430,7 @@ class _Extents(NamedTuple):
     reach: Float[np.ndarray, " items"]  # Farthest point from the centre of mass [m]
 
     @classmethod
-    def of(cls, stage: Stage) -> "_Extents":
+    def of(cls, stage: PictureStage) -> "_Extents":
         offset = np.linalg.norm(np.reshape(stage.offsets, (-1, 3)), axis=1)
         return cls(
             np.array([item.plane is None for item in stage.items], dtype=bool),
@@ -428,7 +438,7 @@ class _Extents(NamedTuple):
         )
 
 
-def _first_alike(take: Take, cameras: Sequence[AbstractCamera]) -> Int[np.ndarray, " frames"]:
+def _first_alike(take: Take, cameras: Sequence[vision.AbstractCamera]) -> Int[np.ndarray, " frames"]:
     """For each frame, the first one of those since which nothing is seen to move."""
     first, extents = np.zeros(len(take.times), dtype=int), _Extents.of(take.drawn)
     for frame in range(1, len(first)):
@@ -439,7 +449,7 @@ def _first_alike(take: Take, cameras: Sequence[AbstractCamera]) -> Int[np.ndarra
 
 
 def _seen_to_move(
-    take: Take, extents: _Extents, cameras: Sequence[AbstractCamera], before: int, now: int
+    take: Take, extents: _Extents, cameras: Sequence[vision.AbstractCamera], before: int, now: int
 ) -> float:
     """A bound on how far anything moves in the picture [pixels] between two frames."""
     old, camera = cameras[before], cameras[now]
@@ -459,11 +469,11 @@ def _seen_to_move(
     return float(way.max(initial=0) / (near * camera.pixel_angle))
 
 
-def _is_shifted(camera: AbstractCamera, other: AbstractCamera) -> bool:
+def _is_shifted(camera: vision.AbstractCamera, other: vision.AbstractCamera) -> bool:
     """Whether two cameras differ in where they are alone."""
     return (
-        isinstance(camera, Camera)
-        and isinstance(other, Camera)
+        isinstance(camera, vision.Camera)
+        and isinstance(other, vision.Camera)
         and (camera.width, camera.height, camera.vertical_fov)
         == (other.width, other.height, other.vertical_fov)
         and bool(np.abs(camera.axes - other.axes).max() < _UNSEEN * camera.pixel_angle)
@@ -473,7 +483,7 @@ def _is_shifted(camera: AbstractCamera, other: AbstractCamera) -> bool:
 def _picture(
     take: Take,
     image: UInt8[np.ndarray, "height width 3"],
-    camera: AbstractCamera,
+    camera: vision.AbstractCamera,
     frame: int,
     arrow: float,
     options: VideoOptions,

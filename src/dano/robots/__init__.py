@@ -12,16 +12,17 @@ from dano.robots._dynamics import (
     mass_matrix as mass_matrix,
 )
 from dano.robots._geometry import mesh_of as mesh_of
-from dano.robots._inspect import robot_doubts as robot_doubts, robot_tree as robot_tree
+from dano.robots._inspect import (
+    load_mjcf as load_mjcf,
+    load_urdf as load_urdf,
+    read_robot as read_robot,
+    robot_doubts as robot_doubts,
+    robot_tree as robot_tree,
+)
 from dano.robots._inverse import (
     inverse_kinematics as inverse_kinematics,
     InverseKinematics as InverseKinematics,
     Target as Target,
-)
-from dano.robots._loading import (
-    load_mjcf as load_mjcf,
-    load_urdf as load_urdf,
-    read_robot as read_robot,
 )
 from dano.robots._loops import close_loops as close_loops, loop_gaps as loop_gaps
 from dano.robots._operational import operational_space_torque as operational_space_torque

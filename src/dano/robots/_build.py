@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from dano import fields, maths, scene
 from dano.checks import shown
-from dano.fields import AbstractShape, HalfSpace, Sphere
-from dano.maths import Pose, quat_conjugate, quat_multiply
+from dano.robots import formats
+from dano.robots._dynamics import balanced, chained, Inertial
 from dano.robots._free import FREE_JOINTS, without_free_laws
 from dano.robots._geometry import checked_collision, shape_of
-from dano.robots._inertia import balanced, chained, Inertial
 from dano.robots._parts import (
     checked_base,
     FLOATING,
@@ -23,18 +23,6 @@ from dano.robots._parts import (
     without_weightless,
 )
 from dano.robots._robot import PLANE, Robot
-from dano.robots.formats import (
-    checked_ignore,
-    Connection,
-    Description,
-    EQUALITIES,
-    MASSES,
-    Placed,
-    rotation_of,
-    Solid,
-    Tie,
-)
-from dano.scene import Body, Joint, Loop, Motor
 
 # Radius of what stands for a link without a shape, in pictures only [m].
 _MARK = 0.01
@@ -43,9 +31,9 @@ Frames = dict[str, tuple[str | None, np.ndarray, np.ndarray]]
 
 
 def build_robot(
-    description: Description,
+    description: formats.Description,
     *,
-    base: Pose | str | None = None,
+    base: maths.Pose | str | None = None,
     prefix: str = "",
     collision: bool | str | Mapping[str, str] = True,
     ignore: str | Sequence[str] = (),
@@ -56,18 +44,18 @@ def build_robot(
         raise ValueError(f"prefix must be a string, got {shown(prefix)}")
     place = checked_base(base, description)
     shapes = checked_collision(collision, [link.name for link in description.links])
-    ignored = checked_ignore(ignore)
+    ignored = formats.checked_ignore(ignore)
     description = without_lacking(description, ignored)
     description = without_free_laws(description, ignored=FREE_JOINTS in ignored)
     if balance_inertia:
         description = balanced(description)
     description = without_weightless(description, ignored)
     parts = parts_of(description, place)
-    weighed = MASSES not in ignored
+    weighed = formats.MASSES not in ignored
     inertials = inertials_of(parts) if weighed else placeholders_of(parts)
     for note in description.notes:
         warnings.warn(f"{description.source}: {note}", UserWarning, stacklevel=3)
-    bodies: list[Body] = []
+    bodies: list[scene.Body] = []
     frames: Frames = {}
     touching, surroundings = [], []
     places: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -113,7 +101,7 @@ def _bodies(
     inertial: Inertial | None,
     *,
     weighed: bool,
-) -> list[tuple[Body, bool]]:
+) -> list[tuple[scene.Body, bool]]:
     """The bodies of a group, and whether each has a shape; none for what stands still without one."""
     description = parts.description
     where = f"{description.source}: link {name!r}"
@@ -134,30 +122,32 @@ def _bodies(
         ]
         if len(planes) > 1:
             raise ValueError(f"{where}: a link must have one plane, got {len(planes)}")
-        return [(Body(what, each, fixed=True), True) for what, each in made]
+        return [(scene.Body(what, each, fixed=True), True) for what, each in made]
     if planes:
         raise ValueError(f"{where}: a plane must stand still, got one on a link that moves")
     mass, com, inertia = inertial
     # Those that differ are refused before; links without mass have no weight.
     held = next((link.gravcomp for link, _ in links if link.mass > 0 and link.gravcomp), None)
-    geometry = Sphere(_MARK) if shape is None else shape
+    geometry = fields.Sphere(_MARK) if shape is None else shape
     try:
-        body = Body(name, geometry, mass=mass, com=com, inertia=inertia, gravcomp=held, weighed=weighed)
+        body = scene.Body(name, geometry, mass=mass, com=com, inertia=inertia, gravcomp=held, weighed=weighed)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     return [(body, shape is not None)]
 
 
-def _half_space(solid: Solid, place: Placed) -> AbstractShape:
+def _half_space(solid: formats.Solid, place: formats.Placed) -> fields.AbstractShape:
     at = chained(place, solid.place)
-    normal = rotation_of(at.orientation)[:, 2]
-    return HalfSpace(normal, float(normal @ np.array(at.position)))
+    normal = formats.rotation_of(at.orientation)[:, 2]
+    return fields.HalfSpace(normal, float(normal @ np.array(at.position)))
 
 
-def _joint(description: Description, joint: Connection, frames: Frames, prefix: str) -> Joint:
+def _joint(
+    description: formats.Description, joint: formats.Connection, frames: Frames, prefix: str
+) -> scene.Joint:
     """A joint between bodies: places of links in their bodies are part of its own."""
     parent, position, orientation = frames[joint.parent]
-    own = Placed(tuple(map(float, position)), tuple(map(float, orientation)))
+    own = formats.Placed(tuple(map(float, position)), tuple(map(float, orientation)))
     place = _as_arrays(chained(own, joint.place))
     where = f"{description.source}: joint {joint.name!r}"
     options: dict[str, Any] = {}
@@ -182,11 +172,11 @@ def _joint(description: Description, joint: Connection, frames: Frames, prefix: 
                 f"{where}: efforts {joint.efforts} let nothing through of actuator {drive.name!r}, whose"
                 f" force is between {drive.limits[0]} and {drive.limits[1]}"
             )
-        options["motor"] = Motor(
+        options["motor"] = scene.Motor(
             drive.kind, stiffness=drive.stiffness, damping=drive.damping, gear=drive.gear, limits=limits
         )
     try:
-        return Joint(
+        return scene.Joint(
             parent,
             prefix + joint.child,
             joint.kind,
@@ -201,19 +191,19 @@ def _joint(description: Description, joint: Connection, frames: Frames, prefix: 
         raise ValueError(f"{where}: {error}") from error
 
 
-def _largest_effort(joint: Connection) -> float:
+def _largest_effort(joint: formats.Connection) -> float:
     if joint.drive is None:
         return joint.effort
     return min(joint.effort, abs(joint.drive.gear) * max(map(abs, joint.drive.limits)))
 
 
 def _closing(
-    description: Description,
+    description: formats.Description,
     frames: Frames,
-    moving: Sequence[Connection],
+    moving: Sequence[formats.Connection],
     prefix: str,
     ignored: Sequence[str],
-) -> list[Tie]:
+) -> list[formats.Tie]:
     """The ties of which at least one body hangs on a joint.
 
     Raises:
@@ -224,27 +214,29 @@ def _closing(
     for tie in description.ties:
         if {frames[tie.first][0], frames[tie.second][0]} & hanging:
             found.append(tie)
-        elif EQUALITIES not in ignored:
+        elif formats.EQUALITIES not in ignored:
             raise ValueError(
                 f"{description.source}: an equality ties {tie.first!r} and {tie.second!r}, and neither hangs"
-                f" on a joint: dano ties chains of joints; ignore=[{EQUALITIES!r}] leaves it out"
+                f" on a joint: dano ties chains of joints; ignore=[{formats.EQUALITIES!r}] leaves it out"
             )
     return found
 
 
-def _loop(tie: Tie, frames: Frames) -> Loop:
+def _loop(tie: formats.Tie, frames: Frames) -> scene.Loop:
     """A loop between bodies: places of links in their bodies are part of its own."""
     (first, *place), (second, *other) = frames[tie.first], frames[tie.second]
-    points = [_moved((p, q), Placed(x)) for (p, q), x in ((place, tie.position), (other, tie.anchor))]
-    turn = quat_multiply(quat_multiply(place[1], np.array(tie.orientation)), quat_conjugate(other[1]))
+    points = [_moved((p, q), formats.Placed(x)) for (p, q), x in ((place, tie.position), (other, tie.anchor))]
+    turn = maths.quat_multiply(
+        maths.quat_multiply(place[1], np.array(tie.orientation)), maths.quat_conjugate(other[1])
+    )
     if second is None:
-        first, second, points, turn = second, first, points[::-1], quat_conjugate(turn)
+        first, second, points, turn = second, first, points[::-1], maths.quat_conjugate(turn)
     if second is None:
         raise ValueError(f"loop must join links that move, got {tie.first!r} and {tie.second!r}")
-    return Loop(first, second, tie.kind, position=points[0][0], anchor=points[1][0], orientation=turn)
+    return scene.Loop(first, second, tie.kind, position=points[0][0], anchor=points[1][0], orientation=turn)
 
 
-def _leader(description: Description, joint: Connection) -> tuple[str, float, float] | None:
+def _leader(description: formats.Description, joint: formats.Connection) -> tuple[str, float, float] | None:
     """The child of the joint that one mimics, through others that mimic, too; with ratio and shift."""
     ratio, shift, at = 1.0, 0.0, joint
     named = {each.name: each for each in description.joints}
@@ -254,10 +246,10 @@ def _leader(description: Description, joint: Connection) -> tuple[str, float, fl
     return None if at is joint else (at.child, ratio, shift)
 
 
-def _as_arrays(place: Placed) -> tuple[np.ndarray, np.ndarray]:
+def _as_arrays(place: formats.Placed) -> tuple[np.ndarray, np.ndarray]:
     return np.array(place.position), np.array(place.orientation)
 
 
-def _moved(frame: tuple[np.ndarray, np.ndarray], place: Placed) -> tuple[np.ndarray, np.ndarray]:
+def _moved(frame: tuple[np.ndarray, np.ndarray], place: formats.Placed) -> tuple[np.ndarray, np.ndarray]:
     position, orientation = (tuple(map(float, x)) for x in frame)
-    return _as_arrays(chained(Placed(position, orientation), place))
+    return _as_arrays(chained(formats.Placed(position, orientation), place))

@@ -9,29 +9,12 @@ from collections.abc import Mapping, Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from dano.caches import digest, find, keep
+from dano import caches, fields
 from dano.checks import shown
 from dano.extras import MESHES
-from dano.fields import (
-    AbstractShape,
-    Box,
-    Capsule,
-    companion_files,
-    convex_pieces,
-    Cylinder,
-    Ellipsoid,
-    hull_field,
-    load_field,
-    mesh_field,
-    posed,
-    save_field,
-    SignedDistanceGrid,
-    Sphere,
-    union,
-)
 from dano.maths import Pose
 from dano.names import did_you_mean
-from dano.robots.formats import Placed, read_collada, Solid
+from dano.robots import formats
 
 COLLISION = ("hull", "distance", "pieces", "none")
 """What links touch with in place of meshes."""
@@ -68,7 +51,9 @@ def checked_collision(collision: bool | str | Mapping[str, str], links: Sequence
     return {name: collision.get(name, "hull") for name in links}
 
 
-def shape_of(solids: Sequence[tuple[Solid, Placed, str]], where: str) -> AbstractShape | None:
+def shape_of(
+    solids: Sequence[tuple[formats.Solid, formats.Placed, str]], where: str
+) -> fields.AbstractShape | None:
     """The union of solids, each in a frame that has a place in the body's; None without any.
 
     Args:
@@ -84,25 +69,25 @@ def shape_of(solids: Sequence[tuple[Solid, Placed, str]], where: str) -> Abstrac
     ]
     if not shapes:
         return None
-    return shapes[0] if len(shapes) == 1 else union(*shapes)
+    return shapes[0] if len(shapes) == 1 else fields.union(*shapes)
 
 
-def _placed(shape: AbstractShape, place: Placed) -> AbstractShape:
-    if place == Placed():
+def _placed(shape: fields.AbstractShape, place: formats.Placed) -> fields.AbstractShape:
+    if place == formats.Placed():
         return shape
-    return posed(shape, Pose(place.position, place.orientation))
+    return fields.posed(shape, Pose(place.position, place.orientation))
 
 
-def _shape(solid: Solid, kind: str, where: str) -> AbstractShape:
+def _shape(solid: formats.Solid, kind: str, where: str) -> fields.AbstractShape:
     numbers = solid.numbers
     if solid.kind == "mesh":
         return _of_mesh(solid, kind, where)
     make = {
-        "box": lambda: Box(numbers),
-        "sphere": lambda: Sphere(*numbers),
-        "cylinder": lambda: Cylinder(*numbers),
-        "capsule": lambda: Capsule(*numbers),
-        "ellipsoid": lambda: Ellipsoid(numbers),
+        "box": lambda: fields.Box(numbers),
+        "sphere": lambda: fields.Sphere(*numbers),
+        "cylinder": lambda: fields.Cylinder(*numbers),
+        "capsule": lambda: fields.Capsule(*numbers),
+        "ellipsoid": lambda: fields.Ellipsoid(numbers),
     }[solid.kind]
     try:
         return make()
@@ -110,7 +95,7 @@ def _shape(solid: Solid, kind: str, where: str) -> AbstractShape:
         raise ValueError(f"{where}: {error}") from error
 
 
-def _of_mesh(solid: Solid, kind: str, where: str) -> AbstractShape:
+def _of_mesh(solid: formats.Solid, kind: str, where: str) -> fields.AbstractShape:
     """What stands for a mesh, from the cache if the same was made before."""
     if solid.path is not None and not solid.path.is_file():
         raise ValueError(
@@ -122,50 +107,50 @@ def _of_mesh(solid: Solid, kind: str, where: str) -> AbstractShape:
     path = "mesh" if solid.path is None else str(solid.path)
     try:
         if kind == "pieces":
-            hulls = [hull_field(points, _HULL_RESOLUTION) for points in _pieces(solid)]
-            return hulls[0] if len(hulls) == 1 else union(*hulls)
+            hulls = [fields.hull_field(points, _HULL_RESOLUTION) for points in _pieces(solid)]
+            return hulls[0] if len(hulls) == 1 else fields.union(*hulls)
         name = _kept_name(solid, kind)
         if name is not None and (found := _kept_shape(name)) is not None:
             return found
         mesh = mesh_of(solid)
-        made = _distance(mesh) if kind == "distance" else hull_field(mesh[0], _HULL_RESOLUTION)
+        made = _distance(mesh) if kind == "distance" else fields.hull_field(mesh[0], _HULL_RESOLUTION)
     except ValueError as error:
         raise ValueError(
             f"{where}: {path}: {error}; collision=… chooses what stands for meshes, of all links or of one"
         ) from error
-    if name is None or keep(_KIND, name, lambda file: save_field(made, file)) is None:
+    if name is None or caches.keep(_KIND, name, lambda file: fields.save_field(made, file)) is None:
         return made
     # As it will be found the next time.
     return _kept_shape(name) or made
 
 
-def _kept_shape(name: str) -> SignedDistanceGrid | None:
+def _kept_shape(name: str) -> fields.SignedDistanceGrid | None:
     """What is kept under a name; None if there is nothing, or nothing that can be read."""
-    kept = find(_KIND, name)
+    kept = caches.find(_KIND, name)
     try:
-        found = None if kept is None else load_field(kept)
+        found = None if kept is None else fields.load_field(kept)
     except ValueError:
         return None
-    return found if isinstance(found, SignedDistanceGrid) else None
+    return found if isinstance(found, fields.SignedDistanceGrid) else None
 
 
-def _pieces(solid: Solid) -> list[np.ndarray]:
+def _pieces(solid: formats.Solid) -> list[np.ndarray]:
     """Corners of the convex pieces of a mesh [m]; to find them takes seconds."""
     name = _kept_name(solid, "pieces")
-    if name is not None and (kept := find(_KIND, name)) is not None:
+    if name is not None and (kept := caches.find(_KIND, name)) is not None:
         try:
             with np.load(kept) as found:
                 return [found[key] for key in found.files]
         except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
             # Damaged: it is made anew, and replaced.
             pass
-    pieces = [points for points, _ in convex_pieces(mesh_of(solid), _CONCAVITY)]
+    pieces = [points for points, _ in fields.convex_pieces(mesh_of(solid), _CONCAVITY)]
     if name is not None:
-        keep(_KIND, name, lambda file: np.savez(file, *pieces))
+        caches.keep(_KIND, name, lambda file: np.savez(file, *pieces))
     return pieces
 
 
-def mesh_of(solid: Solid) -> Triangles:
+def mesh_of(solid: formats.Solid) -> Triangles:
     """Vertices [m, frame of the solid] and faces of a mesh, scaled as the file says; no point is of no face.
 
     Raises:
@@ -175,13 +160,13 @@ def mesh_of(solid: Solid) -> Triangles:
     return _scaled(_read(solid), solid.numbers)
 
 
-def _read(solid: Solid) -> Triangles:
+def _read(solid: formats.Solid) -> Triangles:
     """Vertices and faces of a mesh; several parts of a file are one."""
     if solid.triangles is not None:
         return solid.triangles
     assert solid.path is not None
     if solid.path.suffix.lower() == ".dae":
-        return read_collada(solid.path)
+        return formats.read_collada(solid.path)
     trimesh = MESHES.load()
     try:
         mesh = trimesh.load_mesh(solid.path)
@@ -201,18 +186,18 @@ def _scaled(mesh: Triangles, scale: Sequence[float]) -> Triangles:
     return mesh[0][used] * np.array(scale), faces[:, ::-1] if np.prod(scale) < 0 else faces
 
 
-def _distance(mesh: Triangles) -> SignedDistanceGrid:
+def _distance(mesh: Triangles) -> fields.SignedDistanceGrid:
     trimesh = MESHES.load()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        return mesh_field(trimesh.Trimesh(*mesh, process=False), _RESOLUTION)
+        return fields.mesh_field(trimesh.Trimesh(*mesh, process=False), _RESOLUTION)
 
 
-def _kept_name(solid: Solid, kind: str) -> str | None:
+def _kept_name(solid: formats.Solid, kind: str) -> str | None:
     """What the shape of a mesh is kept under; None if it cannot be kept."""
     words = kind, tuple(solid.numbers), jnp.result_type(float).name
-    files = [] if solid.path is None else [solid.path, *companion_files(solid.path)]
+    files = [] if solid.path is None else [solid.path, *fields.companion_files(solid.path)]
     arrays = [] if solid.triangles is None else [np.ascontiguousarray(array) for array in solid.triangles]
     told = [hashlib.sha256(array.tobytes()).hexdigest() for array in arrays]
-    name = digest(files, *words, *told)
+    name = caches.digest(files, *words, *told)
     return None if name is None else f"{name}.npz"

@@ -8,7 +8,8 @@ import numpy as np
 
 from dano.checks import shown
 from dano.maths import Pose
-from dano.robots._inertia import (
+from dano.robots import formats
+from dano.robots._dynamics import (
     carried_inertials,
     chained,
     completed,
@@ -19,17 +20,6 @@ from dano.robots._inertia import (
     ROUNDED,
     weightless_joints,
 )
-from dano.robots.formats import (
-    at_home,
-    Description,
-    GRAVCOMP,
-    held_at,
-    Lacking,
-    MASSES,
-    Placed,
-    WEIGHTLESS,
-    without_followers,
-)
 
 FLOATING = "floating"
 
@@ -37,20 +27,20 @@ FLOATING = "floating"
 class Parts(NamedTuple):
     """A description, and what follows from it before there are bodies."""
 
-    description: Description  # The file, without what is left out
-    groups: dict[str, dict[str, Placed]]  # Links that move as one
-    places: dict[str, Placed]  # Where each group stands in the pose of the file [W]
+    description: formats.Description  # The file, without what is left out
+    groups: dict[str, dict[str, formats.Placed]]  # Links that move as one
+    places: dict[str, formats.Placed]  # Where each group stands in the pose of the file [W]
     fixed: frozenset[str]  # Groups that never move
     free: frozenset[str]  # Groups that move freely
 
 
-def checked_base(base: Pose | str | None, description: Description) -> Placed | None:
+def checked_base(base: Pose | str | None, description: formats.Description) -> formats.Placed | None:
     """Where the root stands; None if it moves freely."""
     if base is None:
-        return Placed()
+        return formats.Placed()
     if isinstance(base, Pose):
         numbers = (np.asarray(x, float).tolist() for x in (base.position, base.orientation))
-        return Placed(*(tuple(x) for x in numbers))
+        return formats.Placed(*(tuple(x) for x in numbers))
     if not (isinstance(base, str) and base == FLOATING):
         raise ValueError(f"base must be a dano.Pose, 'floating' or None, got {shown(base)}")
     floats = any(joint.kind == FLOATING for joint in description.joints)
@@ -60,10 +50,10 @@ def checked_base(base: Pose | str | None, description: Description) -> Placed | 
             f" {description.source} a <freejoint/>"
         )
     # A file with a floating joint says itself what floats.
-    return Placed() if floats else None
+    return formats.Placed() if floats else None
 
 
-def without_lacking(description: Description, ignored: Sequence[str]) -> Description:
+def without_lacking(description: formats.Description, ignored: Sequence[str]) -> formats.Description:
     """The description without what is to be left out.
 
     Raises:
@@ -75,41 +65,41 @@ def without_lacking(description: Description, ignored: Sequence[str]) -> Descrip
         left = [each for each in left if each.feature != "other actuators"]
         joints = tuple(dataclasses.replace(joint, drive=None) for joint in description.joints)
         description = dataclasses.replace(description, joints=joints)
-    if GRAVCOMP in ignored:
+    if formats.GRAVCOMP in ignored:
         links = tuple(dataclasses.replace(link, gravcomp=0.0) for link in description.links)
         description = dataclasses.replace(description, links=links)
     # What hangs on tendons is gone with them.
     if "tendons" in ignored:
         left = [each for each in left if "tendon" not in each.text]
     # Weight is for who simulates: kinematics need none of it.
-    refused = [each for each in left if each.feature != GRAVCOMP]
+    refused = [each for each in left if each.feature != formats.GRAVCOMP]
     if refused:
         raise ValueError(f"{description.source}: {lacking_text(left)}")
     return dataclasses.replace(description, lacking=tuple(left))
 
 
-def lacking_text(lacking: Sequence[Lacking]) -> str:
+def lacking_text(lacking: Sequence[formats.Lacking]) -> str:
     """One line that says what there is and how it is left out."""
     names = list(dict.fromkeys(each.feature for each in lacking))
     others = "" if len(lacking) == 1 else f" (and {len(lacking) - 1} more)"
     return f"{lacking[0].text}{others}; ignore={names} leaves it out"
 
 
-def parts_of(description: Description, base: Placed | None) -> Parts:
+def parts_of(description: formats.Description, base: formats.Placed | None) -> Parts:
     """Groups of links, where they stand with the root at `base`, which is None if it moves freely."""
     groups = grouped_links(description)
     owner = {link: head for head, members in groups.items() for link in members}
     held = {joint.child: joint for joint in description.joints if joint.child in groups}
-    places: dict[str, Placed] = {}
+    places: dict[str, formats.Placed] = {}
     fixed, free = set(), set()
     for name in groups:
         joint = held.get(name)
         if joint is None:
-            places[name] = Placed() if base is None else base
+            places[name] = formats.Placed() if base is None else base
             (free if base is None else fixed).add(name)
             continue
         head = owner[joint.parent]
-        places[name] = chained(chained(places[head], groups[head][joint.parent]), at_home(joint))
+        places[name] = chained(chained(places[head], groups[head][joint.parent]), formats.at_home(joint))
         if joint.kind == FLOATING:
             free.add(name)
         elif joint.kind == "weld":
@@ -161,28 +151,30 @@ def _check_possible(where: str, name: str, inertia: np.ndarray) -> None:
         )
 
 
-def without_weightless(description: Description, ignored: Sequence[str]) -> Description:
+def without_weightless(description: formats.Description, ignored: Sequence[str]) -> formats.Description:
     """The description with joints that move nothing with mass held where they are, if they are to be.
 
     Raises:
         ValueError: If there are some, and they are not.
     """
     groups = grouped_links(description)
-    if MASSES in ignored:
+    if formats.MASSES in ignored:
         return description
     while names := weightless_joints(description, groups, own_inertials(description, groups)):
-        if WEIGHTLESS not in ignored:
+        if formats.WEIGHTLESS not in ignored:
             shown_names = ", ".join(map(repr, names[:4])) + (" …" if len(names) > 4 else "")
             raise ValueError(
                 f"{description.source}: mass must be > 0 kg, and the inertia about its axis, of what each"
                 f" joint moves by itself, got none for {shown_names}: give the links mass or the joint"
-                f" armature, or hold it where it is with ignore=[{WEIGHTLESS!r}]; kinematics alone needs no"
-                f" mass, with ignore=[{MASSES!r}]"
+                f" armature, or hold it where it is with ignore=[{formats.WEIGHTLESS!r}]; kinematics alone"
+                f" needs no"
+                f" mass, with ignore=[{formats.MASSES!r}]"
             )
         joints = [
-            held_at(joint, joint.home) if joint.name in names else joint for joint in description.joints
+            formats.held_at(joint, joint.home) if joint.name in names else joint
+            for joint in description.joints
         ]
         held = {joint.name: joint.home for joint in description.joints if joint.name in names}
-        description = dataclasses.replace(description, joints=tuple(without_followers(joints, held)))
+        description = dataclasses.replace(description, joints=tuple(formats.without_followers(joints, held)))
         groups = grouped_links(description)
     return description

@@ -25,7 +25,7 @@ from dano.maths import (
     quat_rotate,
 )
 from dano.names import did_you_mean
-from dano.robots.formats import Description, Drive, Keyframe, Meeting
+from dano.robots.formats import Description, Drive, GeomPair, Keyframe
 from dano.scene import Body, Contact, Control, Frames, Joint, Loop, Scene, State, unnamed_contacts
 
 PLANE = " plane"
@@ -165,7 +165,7 @@ class Robot:
         names = (body, body.removesuffix(PLANE))
         return [link for link, (name, *_) in self.frames.items() if name in names]
 
-    def _meetings(self, a: str, b: str) -> list[Meeting]:
+    def _meetings(self, a: str, b: str) -> list[GeomPair]:
         """How the links of two bodies touch each other, by the file."""
         meets = self.description.meets or {}
         pairs = (frozenset(pair) for pair in itertools.product(self._links(a), self._links(b)))

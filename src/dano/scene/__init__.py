@@ -25,16 +25,21 @@ from dano.scene._frames import (
     step_twists as step_twists,
     triples as triples,
 )
-from dano.scene._joint_laws import JointLaws as JointLaws
-from dano.scene._joints import Joint as Joint, JOINT_KINDS as JOINT_KINDS, Layout as Layout
+from dano.scene._joints import (
+    Joint as Joint,
+    JOINT_KINDS as JOINT_KINDS,
+    JointLaws as JointLaws,
+    Layout as Layout,
+    Motor as Motor,
+    MOTOR_KINDS as MOTOR_KINDS,
+)
 from dano.scene._loops import Loop as Loop, LOOP_KINDS as LOOP_KINDS, Loops as Loops
-from dano.scene._motors import Motor as Motor, MOTOR_KINDS as MOTOR_KINDS
 from dano.scene._others import (
     Others as Others,
     touching_pairs as touching_pairs,
     unnamed_contacts as unnamed_contacts,
 )
-from dano.scene._scene import Scene as Scene
+from dano.scene._scene import lifted as lifted, pulls as pulls, Scene as Scene
 from dano.scene._states import (
     BodyMotion as BodyMotion,
     coming_from as coming_from,
@@ -47,4 +52,3 @@ from dano.scene._states import (
     STATE_SIZES as STATE_SIZES,
     Trajectory as Trajectory,
 )
-from dano.scene._weights import lifted as lifted, pulls as pulls

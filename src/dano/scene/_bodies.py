@@ -8,34 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano import contact, fields, maths, objects
 from dano.checks import checked_optional, checked_text
-from dano.contact import Collider, ContactParams, SampleSet, Support, SurfaceSet
-from dano.fields import (
-    AbstractField,
-    AbstractShape,
-    Box,
-    Cylinder,
-    Ellipsoid,
-    HalfSpace,
-    SignedDistanceGrid,
-    Sphere,
-)
-from dano.hosted import hosted
-from dano.maths import (
-    AnyArray,
-    by_numpy,
-    checked_array,
-    checked_quaternion,
-    floating,
-    is_traced,
-    library,
-    Numbers,
-    Q,
-    quat_rotate,
-    stacked,
-)
+from dano.compiling import one_program
 from dano.names import did_you_mean
-from dano.objects import checked_inertia, MassProperties, NeuralObject
 from dano.programs import keep_programs
 
 # Orientations over which the support of a body is sampled.
@@ -87,11 +63,11 @@ class Body(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    shape: AbstractShape | None
-    object: NeuralObject | None
-    samples: SampleSet | None
-    support: Support | None
-    surface: SurfaceSet | None
+    shape: fields.AbstractShape | None
+    object: objects.NeuralObject | None
+    samples: contact.SampleSet | None
+    support: contact.Support | None
+    surface: contact.SurfaceSet | None
     extent: Float[Array, "6"] | None
     density_scale: Float[Array, ""]
     mass: Float[Array, ""]
@@ -99,7 +75,7 @@ class Body(eqx.Module):
     com: Float[Array, "3"]
     mass_scale: Float[Array, ""]
     com_offset: Float[Array, "3"]
-    material: ContactParams | None
+    material: contact.ContactParams | None
     gravcomp: Float[Array, ""] | None
     fixed: bool = eqx.field(static=True)
     weighed: bool = eqx.field(static=True)
@@ -108,18 +84,18 @@ class Body(eqx.Module):
     def __init__(
         self,
         name: str,
-        geometry: NeuralObject | AbstractField,
+        geometry: objects.NeuralObject | fields.AbstractField,
         *,
-        mass: Numbers | None = None,
-        inertia: Numbers | None = None,
-        com: Numbers | None = None,
-        mass_scale: Numbers = 1.0,
-        com_offset: Numbers = (0.0, 0.0, 0.0),
-        material: ContactParams | None = None,
-        gravcomp: Numbers | None = None,
+        mass: maths.Numbers | None = None,
+        inertia: maths.Numbers | None = None,
+        com: maths.Numbers | None = None,
+        mass_scale: maths.Numbers = 1.0,
+        com_offset: maths.Numbers = (0.0, 0.0, 0.0),
+        material: contact.ContactParams | None = None,
+        gravcomp: maths.Numbers | None = None,
         fixed: bool = False,
         weighed: bool = True,
-        **start: Numbers | None,
+        **start: maths.Numbers | None,
     ):
         """A body from a neural object (which brings its mass) or a shape (homogeneous, of the given mass).
 
@@ -149,41 +125,41 @@ class Body(eqx.Module):
         keep_programs()
         self.name = checked_text("name", name)
         self.fixed, self.weighed = bool(fixed), bool(weighed)
-        self.material = checked_optional(f"material of body {name!r}", material, ContactParams)
+        self.material = checked_optional(f"material of body {name!r}", material, contact.ContactParams)
         # One by one: of a chain, pages of the API give all the annotation of the first.
         self.shape, self.object, self.samples = None, None, None
         self.support, self.surface, self.extent = None, None, None
-        self.density_scale = floating(1.0)
-        if isinstance(geometry, NeuralObject):
+        self.density_scale = maths.floating(1.0)
+        if isinstance(geometry, objects.NeuralObject):
             self.object = geometry
-            self.samples = SampleSet.create(geometry.samples.points, geometry.samples.density)
+            self.samples = contact.SampleSet.create(geometry.samples.points, geometry.samples.density)
             surface = geometry.surface
-            self.surface = SurfaceSet.create(surface.points, surface.vectors)
+            self.surface = contact.SurfaceSet.create(surface.points, surface.vectors)
             self.density_scale = _over_mean(geometry.samples.density)
             if geometry.grid is not None:
-                self.support = Support.create(geometry.grid)
-        elif isinstance(geometry, AbstractShape):
+                self.support = contact.Support.create(geometry.grid)
+        elif isinstance(geometry, fields.AbstractShape):
             self.shape = geometry
         else:
             raise ValueError(
                 f"geometry of body {name!r} must be a NeuralObject or a shape, "
                 f"got {type(geometry).__name__}; a field becomes an object by NeuralObject.from_field"
             )
-        mass = None if mass is None else checked_array(f"mass of body {name!r}", mass, (), above=0.0)
+        mass = None if mass is None else maths.checked_array(f"mass of body {name!r}", mass, (), above=0.0)
         properties = _properties(name, geometry, (mass, com, inertia), self.fixed)
         self.mass = properties.mass if mass is None else mass
         self.inertia = (
             _shared(properties.inertia, properties.mass, self.mass)
             if inertia is None
-            else checked_inertia(f"inertia of body {name!r}", inertia)
+            else objects.checked_inertia(f"inertia of body {name!r}", inertia)
         )
-        self.com = properties.com if com is None else checked_array(f"com of body {name!r}", com, (3,))
-        self.mass_scale = checked_array(f"mass_scale of body {name!r}", mass_scale, (), above=0.0)
-        self.com_offset = checked_array(f"com_offset of body {name!r}", com_offset, (3,))
+        self.com = properties.com if com is None else maths.checked_array(f"com of body {name!r}", com, (3,))
+        self.mass_scale = maths.checked_array(f"mass_scale of body {name!r}", mass_scale, (), above=0.0)
+        self.com_offset = maths.checked_array(f"com_offset of body {name!r}", com_offset, (3,))
         self.start = _checked_start(name, start)
         self.gravcomp = None
         if gravcomp is not None:
-            self.gravcomp = checked_array(f"gravcomp of body {name!r}", gravcomp, ())
+            self.gravcomp = maths.checked_array(f"gravcomp of body {name!r}", gravcomp, ())
 
     @property
     def size(self) -> float:
@@ -194,12 +170,12 @@ class Body(eqx.Module):
         return float(np.ptp(np.asarray(self.shape.bounds), axis=0).max())
 
     @property
-    def field(self) -> AbstractField | None:
+    def field(self) -> fields.AbstractField | None:
         """What other bodies' samples query: the shape, or the object's grid."""
         return self.shape if self.object is None else self.object.grid
 
     @property
-    def solid(self) -> AbstractShape | None:
+    def solid(self) -> fields.AbstractShape | None:
         """What other bodies' surface samples press on: the shape, or the object's signed distance."""
         return self.shape if self.object is None else self.object.solid
 
@@ -208,12 +184,12 @@ class Body(eqx.Module):
         """Whether edges and faces of the surface are known exactly; of objects, those of flat faces are."""
         if self.object is not None:
             return self.object.is_flat
-        if isinstance(self.shape, Box):
-            return not is_traced(self.shape.rounding) and float(self.shape.rounding) == 0
-        return isinstance(self.shape, Cylinder | HalfSpace)
+        if isinstance(self.shape, fields.Box):
+            return not maths.is_traced(self.shape.rounding) and float(self.shape.rounding) == 0
+        return isinstance(self.shape, fields.Cylinder | fields.HalfSpace)
 
     @property
-    def centre_of_mass(self) -> Float[AnyArray, "3"]:
+    def centre_of_mass(self) -> Float[maths.AnyArray, "3"]:
         """Where the centre of mass lies, with its offset [m, F]."""
         return self.com + self.com_offset
 
@@ -228,7 +204,7 @@ class Body(eqx.Module):
         vectors = scale.prod() / scale * np.asarray(self.surface.vectors)
         turned = self.surface.turning == "ball"
         # The densest samples of a ball lie at its −z, and turn to where it touches.
-        up = np.array([[0.0, 0.0, 1.0]]) if turned else _directions(ORIENTATIONS)
+        up = np.array([[0.0, 0.0, 1.0]]) if turned else maths.even_directions(ORIENTATIONS)
         heights = up @ points
         depths = np.maximum(depth - (heights - heights.min(axis=1, keepdims=True)), 0)
         facing = np.maximum(-up @ vectors, 0)
@@ -252,14 +228,14 @@ class Body(eqx.Module):
         return int(np.max(np.sum(heights <= heights.min(axis=1, keepdims=True) + layer, axis=1)))
 
     @property
-    def scale(self) -> Float[AnyArray, "3"]:
+    def scale(self) -> Float[maths.AnyArray, "3"]:
         """What directions on the unit ball are multiplied with to lie on the surface [m]; ones if unused."""
         if self.surface is None or self.surface.turning != "ball":
             ones = np.ones(3, self.com.dtype)
-            return ones if library(self.com) is np else floating(ones)
-        if isinstance(self.shape, Sphere):
-            return stacked([self.shape.radius] * 3)
-        assert isinstance(self.shape, Ellipsoid)
+            return ones if maths.library(self.com) is np else maths.floating(ones)
+        if isinstance(self.shape, fields.Sphere):
+            return maths.stacked([self.shape.radius] * 3)
+        assert isinstance(self.shape, fields.Ellipsoid)
         return self.shape.semi_axes
 
     def measured(self) -> Float[Array, "6"]:
@@ -272,23 +248,23 @@ class Body(eqx.Module):
             assert self.shape is not None
             lower, upper = np.asarray(self.shape.bounds)
         if not np.all(np.isfinite(upper - lower)):
-            return floating([0.0, 0.0, 0.0, np.inf, np.inf, np.inf])
+            return maths.floating([0.0, 0.0, 0.0, np.inf, np.inf, np.inf])
         middle, size = 0.5 * (lower + upper), float((upper - lower).max())
-        if isinstance(solid, SignedDistanceGrid):
+        if isinstance(solid, fields.SignedDistanceGrid):
             thickness = -float(np.min(np.asarray(solid.coefficients)))
         else:
-            thickness = 0.0 if solid is None else -float(_distance(solid, floating(middle)))
+            thickness = 0.0 if solid is None else -float(_distance(solid, maths.floating(middle)))
         # The middle of a hollow solid is not a measure of its walls.
         thickness = thickness if thickness > 0 else 0.5 * float((upper - lower).min())
         radius = 0.5 * float(np.linalg.norm(upper - lower))
-        return floating([*middle, radius, size, thickness])
+        return maths.floating([*middle, radius, size, thickness])
 
     def unused(self) -> "Body":
         """This body without what distributed contact asks of it."""
         nothing = (None, np.zeros(6, self.com.dtype))
         return eqx.tree_at(lambda b: (b.surface, b.extent), self, nothing, is_leaf=lambda x: x is None)
 
-    def collider(self, position: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> Collider:
+    def collider(self, position: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> contact.Collider:
         """The body as a contact of shared mass sees it.
 
         Args:
@@ -297,7 +273,7 @@ class Body(eqx.Module):
         """
         com = self.centre_of_mass
         arm = -sum(rotation[:, i] * com[i] for i in range(3))
-        return Collider(
+        return contact.Collider(
             self.field,
             self.samples,
             support=self.support,
@@ -316,15 +292,15 @@ class Body(eqx.Module):
             position: Of its centre of mass [m, W].
             orientation: wxyz.
         """
-        if not isinstance(self.shape, HalfSpace):
+        if not isinstance(self.shape, fields.HalfSpace):
             return None
         turn = np.asarray(orientation)
-        normal = quat_rotate(turn, np.asarray(self.shape.normal_direction))
-        origin = np.asarray(position) - quat_rotate(turn, np.asarray(self.com))
+        normal = maths.quat_rotate(turn, np.asarray(self.shape.normal_direction))
+        origin = np.asarray(position) - maths.quat_rotate(turn, np.asarray(self.com))
         return normal, float(self.shape.offset) + float(normal @ origin)
 
 
-def _checked_start(name: str, start: Mapping[str, Numbers | None]) -> dict[str, Array]:
+def _checked_start(name: str, start: Mapping[str, maths.Numbers | None]) -> dict[str, Array]:
     """What a body says of its start, as arrays.
 
     Raises:
@@ -340,7 +316,11 @@ def _checked_start(name: str, start: Mapping[str, Numbers | None]) -> dict[str, 
             label = f"{key} of body {name!r}"
             size = _START[key]
             shape = np.shape(value) if size is None else (size,)
-            check = checked_quaternion(label, value) if size == 4 else checked_array(label, value, shape)
+            check = (
+                maths.checked_quaternion(label, value)
+                if size == 4
+                else maths.checked_array(label, value, shape)
+            )
             found[key] = check
     check_once(f"start of body {name!r}", found)
     return found
@@ -358,54 +338,48 @@ def check_once(label: str, given: Collection[str]) -> None:
         raise ValueError(f"{label} must be given by omega (axes of the body) or by spin_world, got both")
 
 
-@hosted
-def _distance(shape: AbstractShape, x: Float[Array, "3"]) -> Float[Array, ""]:
+@one_program
+def _distance(shape: fields.AbstractShape, x: Float[Array, "3"]) -> Float[Array, ""]:
     return shape.sdf(x)
 
 
-@by_numpy
-def _over_mean(density: Float[Q, " n"]) -> Float[AnyArray, ""]:
-    return 1 / library(density).mean(density)
+@maths.by_numpy
+def _over_mean(density: Float[maths.Q, " n"]) -> Float[maths.AnyArray, ""]:
+    return 1 / maths.library(density).mean(density)
 
 
-@by_numpy
-def _shared(inertia: Float[Q, "3 3"], own: Float[Q, ""], mass: Float[Q, ""]) -> Float[Q, "3 3"]:
+@maths.by_numpy
+def _shared(
+    inertia: Float[maths.Q, "3 3"], own: Float[maths.Q, ""], mass: Float[maths.Q, ""]
+) -> Float[maths.Q, "3 3"]:
     """Inertia of a body with another mass than its own."""
     return inertia * (mass / own)
 
 
-def _directions(n: int) -> np.ndarray:
-    """Unit vectors spread evenly over the sphere (a Fibonacci lattice), shape (n, 3)."""
-    k = np.arange(n) + 0.5
-    z, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-
-
 def _properties(
     name: str,
-    geometry: NeuralObject | AbstractShape,
-    given: tuple[Numbers | None, Numbers | None, Numbers | None],
+    geometry: objects.NeuralObject | fields.AbstractShape,
+    given: tuple[maths.Numbers | None, maths.Numbers | None, maths.Numbers | None],
     fixed: bool,
-) -> MassProperties:
+) -> objects.MassProperties:
     """Mass, centre of mass and inertia of a neural object, or of a shape from those of them that are given.
 
     Raises:
         ValueError: If the mass of a shape that moves is missing.
     """
-    if isinstance(geometry, NeuralObject):
+    if isinstance(geometry, objects.NeuralObject):
         return geometry.mass
     mass, com, inertia = given
     if mass is not None and com is not None and inertia is not None:
-        return MassProperties(mass, com, inertia)
+        return objects.MassProperties(mass, com, inertia)
     if mass is not None:
         return _homogeneous(name, geometry, float(np.asarray(mass)))
     if not fixed:
         raise ValueError(f"mass of body {name!r} must be given: a shape that moves has none of its own")
-    return MassProperties(1.0, (0.0, 0.0, 0.0), np.eye(3))
+    return objects.MassProperties(1.0, (0.0, 0.0, 0.0), np.eye(3))
 
 
-def _homogeneous(name: str, shape: AbstractShape, mass: float) -> MassProperties:
+def _homogeneous(name: str, shape: fields.AbstractShape, mass: float) -> objects.MassProperties:
     """Mass properties of a homogeneous solid shape: closed form where there is one, else integrated."""
     if not mass > 0:
         raise ValueError(f"mass of body {name!r} must be > 0 kg, got {mass}")
@@ -413,9 +387,9 @@ def _homogeneous(name: str, shape: AbstractShape, mass: float) -> MassProperties
         raise ValueError(f"body {name!r} must have a bounded shape or be fixed, got {type(shape).__name__}")
     moments = shape.solid_moments()
     if moments is None:
-        return MassProperties.from_field(shape, mass=mass)
+        return objects.MassProperties.from_field(shape, mass=mass)
     second = np.asarray(moments.second_moment) * (mass / float(moments.volume))
-    return MassProperties(mass, moments.centroid, np.trace(second) * np.eye(3) - second)
+    return objects.MassProperties(mass, moments.centroid, np.trace(second) * np.eye(3) - second)
 
 
 def alike(bodies: Sequence[Body]) -> list[int]:
@@ -429,7 +403,7 @@ def _geometry(body: Body, number: int) -> Hashable:
     if body.object is not None:
         return id(body.object)
     leaves, tree = jax.tree.flatten((body.shape, body.surface, body.extent))
-    if is_traced(leaves):
+    if maths.is_traced(leaves):
         return -1 - number
     return tree, tuple((x.shape, x.tobytes()) for x in map(np.asarray, leaves))
 

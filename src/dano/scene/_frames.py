@@ -21,8 +21,7 @@ from dano.maths import (
     quat_rotate,
     with_rows,
 )
-from dano.scene._joint_laws import joint_laws, JointLaws
-from dano.scene._joints import Joint, Layout
+from dano.scene._joints import Joint, joint_laws, JointLaws, Layout
 from dano.scene._states import State, STATE_SIZES
 
 RESOLVED = 0.5

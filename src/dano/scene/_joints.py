@@ -1,18 +1,98 @@
-"""Joints between bodies, and the layout of the coordinates that they leave free."""
+"""Joints between bodies, and the layout of the coordinates that they leave free.
+
+What drives joints: commands of a step become torques or forces, within limits and through a gear.
+What acts on joint coordinates, as arrays over them: springs, friction, limits, motors.
+"""
 
 import functools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.checks import checked_choice, checked_optional, checked_text
-from dano.maths import checked_array, checked_quaternion, is_traced, Numbers
+from dano import checks, maths
 from dano.names import did_you_mean
 from dano.scene._loops import Loop
-from dano.scene._motors import checked_limits, Motor
+
+MOTOR_KINDS = ("effort", "position", "velocity")
+"""What the command of a motor is: a torque or force, a place to go to, or a speed to keep."""
+
+
+class Motor(eqx.Module):
+    """A motor on a joint. With gear r it turns r times as far as the joint, and its torque f acts r-fold.
+
+    With joint coordinate q and velocity v at the end of the step, and command u:
+
+        effort      f = u
+        position    f = stiffness (u − r q) − damping r v
+        velocity    f = damping (u − r v)
+
+    f is kept within limits. Taking the end of the step keeps stiff ones stable at any timestep.
+
+    Attributes:
+        kind: "effort", "position" or "velocity".
+        stiffness: Of "position" [N m/rad or N/m].
+        damping: Of "position" and "velocity" [N m s/rad or N s/m].
+        gear: r [1, or rad/m for a motor that turns to move a slide].
+        limits: Least and largest f [N m or N].
+    """
+
+    kind: str = eqx.field(static=True)
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    gear: Float[Array, ""]
+    limits: Float[Array, "2"]
+
+    def __init__(
+        self,
+        kind: str = "effort",
+        *,
+        stiffness: maths.Numbers = 0.0,
+        damping: maths.Numbers = 0.0,
+        gear: maths.Numbers = 1.0,
+        limits: maths.Numbers | None = None,
+    ):
+        """A motor; see the attributes. Without limits f is not bounded.
+
+        Raises:
+            ValueError: If the kind is unknown, a number is out of range, the gear is zero, or what the kind
+                needs is missing.
+        """
+        checks.checked_choice("kind of motor", kind, MOTOR_KINDS)
+        self.kind = kind
+        self.stiffness = maths.checked_array("stiffness of motor", stiffness, ())
+        self.damping = maths.checked_array("damping of motor", damping, ())
+        self.gear = maths.checked_array("gear of motor", gear, ())
+        self.limits = checked_limits("limits of motor", (-np.inf, np.inf) if limits is None else limits)
+        for name in ("stiffness", "damping"):
+            value = getattr(self, name)
+            if not maths.is_traced(value) and float(value) < 0:
+                raise ValueError(f"{name} of motor must be ≥ 0, got {float(value)}")
+        if not maths.is_traced(self.gear) and float(self.gear) == 0:
+            raise ValueError("gear of motor must not be 0, got 0.0")
+        needed = {"effort": (), "position": ("stiffness",), "velocity": ("damping",)}[kind]
+        for name in needed:
+            value = getattr(self, name)
+            if not maths.is_traced(value) and not float(value) > 0:
+                raise ValueError(f"{name} of a {kind} motor must be > 0, got {float(value)}")
+
+
+def checked_limits(name: str, value: maths.Numbers) -> Float[Array, "2"]:
+    """Two numbers of which the first is not the larger; they may be infinite.
+
+    Raises:
+        ValueError: If they are not.
+    """
+    limits = maths.checked_floating(name, value)
+    if limits.shape != (2,):
+        raise ValueError(f"{name} must be two numbers, got shape {limits.shape}")
+    if not maths.is_traced(limits) and not np.less_equal(*np.asarray(limits)):
+        raise ValueError(f"{name} must be a least and a largest number, got {np.asarray(limits).tolist()}")
+    return limits
+
 
 JOINT_KINDS = ("hinge", "slide", "weld", "ball", "planar")
 """What a joint lets its child do: turn about an axis, move along it, nothing, turn about a point, slide on a
@@ -75,19 +155,19 @@ class Joint(eqx.Module):
         child: str,
         kind: str = "hinge",
         *,
-        axis: Numbers = (0.0, 0.0, 1.0),
-        anchor: Numbers = (0.0, 0.0, 0.0),
-        position: Numbers = (0.0, 0.0, 0.0),
-        orientation: Numbers = (1.0, 0.0, 0.0, 0.0),
-        damping: Numbers = 0.0,
-        limits: Numbers | None = None,
-        friction: Numbers | None = None,
-        armature: Numbers | None = None,
-        stiffness: Numbers | None = None,
-        rest: Numbers = 0.0,
+        axis: maths.Numbers = (0.0, 0.0, 1.0),
+        anchor: maths.Numbers = (0.0, 0.0, 0.0),
+        position: maths.Numbers = (0.0, 0.0, 0.0),
+        orientation: maths.Numbers = (1.0, 0.0, 0.0, 0.0),
+        damping: maths.Numbers = 0.0,
+        limits: maths.Numbers | None = None,
+        friction: maths.Numbers | None = None,
+        armature: maths.Numbers | None = None,
+        stiffness: maths.Numbers | None = None,
+        rest: maths.Numbers = 0.0,
         mimics: str | None = None,
-        ratio: Numbers = 1.0,
-        shift: Numbers = 0.0,
+        ratio: maths.Numbers = 1.0,
+        shift: maths.Numbers = 0.0,
         motor: Motor | None = None,
     ):
         """A joint of two bodies of a scene; see the attributes.
@@ -96,33 +176,33 @@ class Joint(eqx.Module):
             ValueError: If the kind is unknown, a body hangs on itself, the axis or the orientation is zero, a
                 shape is wrong, a number is out of range, or the kind has no such thing.
         """
-        checked_choice("kind", kind, JOINT_KINDS)
-        checked_text("child", child)
+        checks.checked_choice("kind", kind, JOINT_KINDS)
+        checks.checked_text("child", child)
         for name, other in (("parent", parent), ("mimics", mimics)):
             if other is not None:
-                checked_text(name, other)
+                checks.checked_text(name, other)
         if parent == child:
             raise ValueError(f"joint must join two different bodies, got {child!r} twice")
         self.parent, self.child, self.kind = parent, child, kind
         what = f"of the joint of {child!r}"
-        axis = checked_array(f"axis {what}", axis, (3,))
+        axis = maths.checked_array(f"axis {what}", axis, (3,))
         length = (axis @ axis) ** 0.5
-        if not is_traced(length) and not float(length) > 0:
+        if not maths.is_traced(length) and not float(length) > 0:
             raise ValueError(f"axis {what} must not be zero, got {np.asarray(axis).tolist()}")
         self.axis = axis / length
-        self.anchor = checked_array(f"anchor {what}", anchor, (3,))
-        self.position = checked_array(f"position {what}", position, (3,))
-        self.orientation = checked_quaternion(f"orientation {what}", orientation)
-        self.damping = checked_array(f"damping {what}", damping, (), least=0.0)
+        self.anchor = maths.checked_array(f"anchor {what}", anchor, (3,))
+        self.position = maths.checked_array(f"position {what}", position, (3,))
+        self.orientation = maths.checked_quaternion(f"orientation {what}", orientation)
+        self.damping = maths.checked_array(f"damping {what}", damping, (), least=0.0)
         self.friction, self.armature, self.stiffness = (
-            None if value is None else checked_array(f"{name} {what}", value, (), least=0.0)
+            None if value is None else maths.checked_array(f"{name} {what}", value, (), least=0.0)
             for name, value in (("friction", friction), ("armature", armature), ("stiffness", stiffness))
         )
         self.limits = None if limits is None else checked_limits(f"limits {what}", limits)
-        self.rest = checked_array(f"rest {what}", rest, ())
-        self.ratio = checked_array(f"ratio {what}", ratio, ())
-        self.shift = checked_array(f"shift {what}", shift, ())
-        self.mimics, self.motor = mimics, checked_optional(f"motor {what}", motor, Motor)
+        self.rest = maths.checked_array(f"rest {what}", rest, ())
+        self.ratio = maths.checked_array(f"ratio {what}", ratio, ())
+        self.shift = maths.checked_array(f"shift {what}", shift, ())
+        self.mimics, self.motor = mimics, checks.checked_optional(f"motor {what}", motor, Motor)
         self._check_kind(what)
 
     def _check_kind(self, what: str) -> None:
@@ -339,3 +419,90 @@ def _coordinates(joints: Sequence[tuple[str | None, str, str, str | None]]):
         first[j] = first[leads[mimics]]
     dofs = tuple((j, k, first[j] + k) for j, joint in enumerate(joints) for k in range(WIDTHS[joint[2]]))
     return tuple(first), dofs
+
+
+class JointLaws(eqx.Module):
+    """What acts on the k coordinates q of a scene. What no joint has is None.
+
+    Damping, friction and armature of a joint that mimics another act on the coordinate of that one, by its
+    ratio; those of a ball or a planar joint on each of its coordinates alike.
+
+    Attributes:
+        damping: [N m s/rad or N s/m], shape (k,).
+        armature: [kg m² or kg].
+        stiffness: Of springs [N m/rad or N/m].
+        rest: Where they exert no force [rad or m].
+        friction: [N m or N].
+        limits: Least and largest q [rad or m], shape (k, 2).
+        motor: Gear, stiffness and damping of motors, and their least and largest effort, see `Motor`;
+            gear 0 where there is none. Shape (k, 5).
+        constant: Whether a motor gives what it is told to, whatever the joint does (static).
+        rough: Coordinates with limits, friction, or a motor that heeds the joint (static).
+    """
+
+    damping: Float[maths.AnyArray, " k"]
+    armature: Float[maths.AnyArray, " k"] | None
+    stiffness: Float[maths.AnyArray, " k"] | None
+    rest: Float[maths.AnyArray, " k"]
+    friction: Float[maths.AnyArray, " k"] | None
+    limits: Float[maths.AnyArray, "k 2"] | None
+    motor: Float[maths.AnyArray, "k 5"] | None
+    constant: tuple[bool, ...] = eqx.field(static=True)
+    rough: tuple[int, ...] = eqx.field(static=True)
+
+
+def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
+    """The laws of the joints of a scene."""
+    owners, xp = [joints[j] for j in layout.with_coordinates], maths.library(*jax.tree.leaves(joints))
+
+    def summed(name: str, power: Callable[[Any], Any]) -> Float[maths.AnyArray, " k"]:
+        values = xp.zeros(layout.n_joints, dtype)
+        for j, _, place in layout.dofs:
+            value = getattr(joints[j], name)
+            if value is not None:
+                share = power(joints[j].ratio) if layout.follows[j] else 1
+                values = maths.with_rows(values, place, values[place] + xp.asarray(share * value, dtype))
+        return values
+
+    def of_some(name: str, power: Callable[[Any], Any]) -> Float[maths.AnyArray, " k"] | None:
+        return summed(name, power) if any(getattr(joint, name) is not None for joint in joints) else None
+
+    def column(values: list[Any]) -> Any:
+        return xp.stack([x.astype(dtype) for x in values]) if values else xp.zeros(0, dtype)
+
+    limits = motor = None
+    if any(joint.limits is not None for joint in owners):
+        free = np.array([-np.inf, np.inf])
+        limits = column([free if joint.limits is None else joint.limits for joint in owners])
+    if any(joint.motor is not None for joint in owners):
+        motor = column([_motor(joint) for joint in owners])
+    constant = tuple(joint.motor is not None and joint.motor.kind == "effort" for joint in owners)
+    heeds = [joint.motor is not None and joint.motor.kind != "effort" for joint in owners]
+    rubs = {place for j, _, place in layout.dofs if joints[j].friction is not None}
+    rough = tuple(
+        place
+        for place, joint in enumerate(owners)
+        if joint.limits is not None or place in rubs or heeds[place]
+    )
+    springs = of_some("stiffness", lambda ratio: ratio)
+    return JointLaws(
+        summed("damping", xp.square),
+        of_some("armature", xp.square),
+        springs,
+        column([joint.rest for joint in owners]),
+        of_some("friction", xp.abs),
+        limits,
+        motor,
+        constant,
+        rough,
+    )
+
+
+def _motor(joint: Joint) -> maths.AnyArray:
+    motor = joint.motor
+    if motor is None:
+        return np.array([0.0, 0.0, 0.0, -np.inf, np.inf])
+    xp = maths.library(*jax.tree.leaves(motor))
+    stiffness = motor.stiffness if motor.kind == "position" else xp.zeros_like(motor.stiffness)
+    damping = motor.damping if motor.kind != "effort" else xp.zeros_like(motor.damping)
+    return xp.concatenate([xp.stack([motor.gear, stiffness, damping]), motor.limits])

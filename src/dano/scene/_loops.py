@@ -9,17 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano import maths
 from dano.checks import checked_choice, checked_text
-from dano.maths import (
-    AnyArray,
-    checked_array,
-    checked_quaternion,
-    library,
-    Numbers,
-    quat_conjugate,
-    quat_multiply,
-    quat_rotate,
-)
 from dano.names import did_you_mean
 
 LOOP_KINDS = ("point", "weld")
@@ -53,9 +44,9 @@ class Loop(eqx.Module):
         second: str,
         kind: str = "point",
         *,
-        position: Numbers = (0.0, 0.0, 0.0),
-        anchor: Numbers = (0.0, 0.0, 0.0),
-        orientation: Numbers = (1.0, 0.0, 0.0, 0.0),
+        position: maths.Numbers = (0.0, 0.0, 0.0),
+        anchor: maths.Numbers = (0.0, 0.0, 0.0),
+        orientation: maths.Numbers = (1.0, 0.0, 0.0, 0.0),
     ):
         """See the class.
 
@@ -70,9 +61,9 @@ class Loop(eqx.Module):
             raise ValueError(f"loop must join two different bodies, got {second!r} twice")
         self.first, self.second, self.kind = first, second, kind
         what = f"of the loop at {second!r}"
-        self.position = checked_array(f"position {what}", position, (3,))
-        self.anchor = checked_array(f"anchor {what}", anchor, (3,))
-        self.orientation = checked_quaternion(f"orientation {what}", orientation)
+        self.position = maths.checked_array(f"position {what}", position, (3,))
+        self.anchor = maths.checked_array(f"anchor {what}", anchor, (3,))
+        self.orientation = maths.checked_quaternion(f"orientation {what}", orientation)
 
 
 class Loops(eqx.Module):
@@ -90,9 +81,9 @@ class Loops(eqx.Module):
     first: tuple[int, ...] = eqx.field(static=True)
     second: tuple[int, ...] = eqx.field(static=True)
     welds: tuple[int, ...] = eqx.field(static=True)
-    position: Float[AnyArray, "l 3"]
-    anchor: Float[AnyArray, "l 3"]
-    orientation: Float[AnyArray, "l 4"]
+    position: Float[maths.AnyArray, "l 3"]
+    anchor: Float[maths.AnyArray, "l 3"]
+    orientation: Float[maths.AnyArray, "l 4"]
 
     @property
     def size(self) -> int:
@@ -100,26 +91,28 @@ class Loops(eqx.Module):
         return 3 * (len(self.first) + len(self.welds))
 
     def gaps(
-        self, position: Float[AnyArray, "n 3"], orientation: Float[AnyArray, "n 4"]
-    ) -> Float[AnyArray, " c"]:
+        self, position: Float[maths.AnyArray, "n 3"], orientation: Float[maths.AnyArray, "n 4"]
+    ) -> Float[maths.AnyArray, " c"]:
         """How far the loops are from being closed, at poses of all bodies.
 
         Returns:
             Distances of the points [m, W], then turns of the welds [rad, F of the first body].
         """
         (x, q), (a, b) = _with_world(position, orientation), self._ends
-        apart = x[b] + quat_rotate(q[b], self.anchor) - x[a] - quat_rotate(q[a], self.position)
+        apart = x[b] + maths.quat_rotate(q[b], self.anchor) - x[a] - maths.quat_rotate(q[a], self.position)
         rows = np.array(self.welds, int)
-        turn = quat_multiply(quat_conjugate(quat_multiply(q[a[rows]], self.orientation[rows])), q[b[rows]])
-        xp = library(apart, turn)
+        turn = maths.quat_multiply(
+            maths.quat_conjugate(maths.quat_multiply(q[a[rows]], self.orientation[rows])), q[b[rows]]
+        )
+        xp = maths.library(apart, turn)
         return xp.concatenate([apart.ravel(), (2 * xp.sign(turn[:, :1]) * turn[:, 1:]).ravel()])
 
     def slopes(
         self,
-        position: Float[AnyArray, "n 3"],
-        orientation: Float[AnyArray, "n 4"],
-        moved: Float[AnyArray, "n 6 k"],
-    ) -> Float[AnyArray, "c k"]:
+        position: Float[maths.AnyArray, "n 3"],
+        orientation: Float[maths.AnyArray, "n 4"],
+        moved: Float[maths.AnyArray, "n 6 k"],
+    ) -> Float[maths.AnyArray, "c k"]:
         """How the gaps change with numbers that move the bodies, where the loops are closed.
 
         Args:
@@ -133,11 +126,11 @@ class Loops(eqx.Module):
         def of(bodies, arms):
             return moved[bodies, :3] - jnp.cross(arms[:, :, None], moved[bodies, 3:], axis=1)
 
-        apart = of(b, quat_rotate(q[b], self.anchor)) - of(a, quat_rotate(q[a], self.position))
+        apart = of(b, maths.quat_rotate(q[b], self.anchor)) - of(a, maths.quat_rotate(q[a], self.position))
         rows = np.array(self.welds, int)
-        back = quat_conjugate(quat_multiply(q[a[rows]], self.orientation[rows]))
+        back = maths.quat_conjugate(maths.quat_multiply(q[a[rows]], self.orientation[rows]))
         turns = (moved[b[rows], 3:] - moved[a[rows], 3:]).transpose(0, 2, 1)
-        own = quat_rotate(back[:, None], turns).transpose(0, 2, 1)
+        own = maths.quat_rotate(back[:, None], turns).transpose(0, 2, 1)
         return jnp.concatenate([apart, own]).reshape(self.size, -1)
 
     @property
@@ -169,14 +162,14 @@ def check_loops(names: Sequence[str], hanging: Sequence[int], loops: Sequence[Lo
             )
 
 
-def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[AnyArray, "n 3"]) -> Loops | None:
+def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[maths.AnyArray, "n 3"]) -> Loops | None:
     """The loops of a scene as arrays, in the dtype of the centres of mass [m, F]; None if there are none."""
     if not loops:
         return None
     first = tuple(len(names) if loop.first is None else names.index(loop.first) for loop in loops)
     second = tuple(names.index(loop.second) for loop in loops)
     welds = tuple(i for i, loop in enumerate(loops) if loop.kind == "weld")
-    xp = library(com, *jax.tree.leaves(loops))
+    xp = maths.library(com, *jax.tree.leaves(loops))
     centres = xp.concatenate([com, xp.zeros((1, 3), com.dtype)])
     position, anchor, orientation = (
         xp.stack([getattr(loop, name) for loop in loops]).astype(com.dtype)
@@ -186,9 +179,9 @@ def loops_of(names: Sequence[str], loops: Sequence[Loop], com: Float[AnyArray, "
     return Loops(first, second, welds, position, anchor, orientation)
 
 
-def _with_world(position: AnyArray, orientation: AnyArray) -> tuple[Any, Any]:
+def _with_world(position: maths.AnyArray, orientation: maths.AnyArray) -> tuple[Any, Any]:
     """Poses with the world as the last row."""
-    xp = library(position, orientation)
+    xp = maths.library(position, orientation)
     still = np.array([[1.0, 0.0, 0.0, 0.0]], orientation.dtype)
     return (
         xp.concatenate([position, np.zeros((1, 3), position.dtype)]),

@@ -1,6 +1,11 @@
-"""Scenes: bodies, the contacts between them, a timestep and gravity."""
+"""Scenes: bodies, the contacts between them, a timestep and gravity.
+
+How long impacts last that are left to the spring.
+What gravity does to each body: all of it, or what a body's `gravcomp` leaves.
+"""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
@@ -9,29 +14,16 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dano.checks import checked_items, checked_kind, checked_optional, shown
-from dano.contact import checked_parameter, ContactParams, Distance, distance
-from dano.maths import (
-    AnyArray,
-    by_numpy,
-    checked_array,
-    is_traced,
-    library,
-    Numbers,
-    on_host,
-    Pose,
-    quat_rotate,
-)
+from dano import checks, maths, notebook
+from dano.contact import checked_parameter, ContactParams, Distance, distance, DistributedLaw
 from dano.names import did_you_mean
-from dano.notebook import card, cloud, plain
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
 from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, started, state_arrays
 from dano.scene._contacts import Contact, prepared
 from dano.scene._doubts import Doubt, doubts_of_scene, doubts_of_state, say_doubts
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
-from dano.scene._impact_duration import impact_duration
-from dano.scene._joints import Joint, Layout, layout_of
+from dano.scene._joints import Joint, Layout, layout_of, Motor
 from dano.scene._loops import check_loops, Loop, Loops, loops_of
 from dano.scene._making import (
     check_contacts,
@@ -44,9 +36,35 @@ from dano.scene._making import (
     warn_of_limits,
     warn_of_long_steps,
 )
-from dano.scene._motors import Motor
 from dano.scene._others import OfEdges, Others, others_of, unnamed_contacts
 from dano.scene._states import check_precision, Control, JOINT_QUANTITIES, State, STATE_SIZES
+
+
+def impact_duration(bodies: Sequence[Body], contact: Contact, speed: float) -> float:
+    """See `Scene.impact_duration`.
+
+    Raises:
+        ValueError: If impacts of the contact are not left to the spring, no body moves, or the speed is not
+            positive.
+    """
+    pair = [next(body for body in bodies if body.name == name) for name in (contact.a, contact.b)]
+    if not (isinstance(contact.law, DistributedLaw) and contact.law.compliant):
+        raise ValueError(
+            f"impacts of {contact.a!r} and {contact.b!r} end within a step: only those of"
+            " law=dano.DistributedLaw(compliant=True) take time"
+        )
+    if maths.is_traced(speed) or not (math.isfinite(speed) and speed > 0):
+        raise ValueError(f"speed must be a positive number [m/s], got {speed}")
+    moving = [body for body in pair if not body.fixed]
+    if not moving:
+        raise ValueError(f"one of {contact.a!r} and {contact.b!r} must move, both are fixed")
+    mass = 1 / sum(1 / float(body.mass * body.mass_scale) for body in moving)
+    body = min((body for body in pair if body.surface is not None), key=lambda body: body.size)
+    depths = body.size * np.geomspace(1e-6, 0.5, 40)
+    forces = float(contact.params.stiffness) * np.array([body.typical_support(d) for d in depths])
+    deepest = int(np.argmax(forces * depths >= mass * speed**2))
+    return math.pi * math.sqrt(mass * depths[deepest] / max(forces[deepest], 1e-300))
+
 
 Parts = TypeVar("Parts", tuple[Joint, ...], tuple[Loop, ...])
 
@@ -90,8 +108,8 @@ class Scene(eqx.Module):
         loops: Sequence[Loop] = (),
         others: ContactParams | None = None,
         apart: Sequence[tuple[str, str]] = (),
-        timestep: Numbers = 0.01,
-        gravity: Numbers = (0.0, 0.0, -9.81),
+        timestep: maths.Numbers = 0.01,
+        gravity: maths.Numbers = (0.0, 0.0, -9.81),
     ) -> "Scene":
         """Check the parts against each other and resolve defaults that depend on both bodies of a contact.
 
@@ -114,20 +132,20 @@ class Scene(eqx.Module):
                 or a pair twice, a pair cannot overlap, joints make no trees, a loop closes no chain, no
                 pair uses a material, or a number is out of range.
         """
-        bodies = checked_items("bodies", bodies, Body)
-        joints = checked_items("joints", joints, Joint)
-        loops = checked_items("loops", loops, Loop)
-        checked_optional("others", others, ContactParams)
+        bodies = checks.checked_items("bodies", bodies, Body)
+        joints = checks.checked_items("joints", joints, Joint)
+        loops = checks.checked_items("loops", loops, Loop)
+        checks.checked_optional("others", others, ContactParams)
         check_names(bodies)
         if contacts is None and others is None:
             contacts = unnamed_contacts(bodies, (*joints, *loops), apart)
             others, apart = (ContactParams(), apart) if contacts is None else (None, ())
-        contacts = checked_items("contacts", () if contacts is None else contacts, Contact)
-        timestep = checked_array("timestep", timestep, (), above=0.0)
+        contacts = checks.checked_items("contacts", () if contacts is None else contacts, Contact)
+        timestep = maths.checked_array("timestep", timestep, (), above=0.0)
         check_contacts(bodies, joints, contacts)
         children = layout_of(*structure(bodies, joints)).children
         check_loops([body.name for body in bodies], children, loops)
-        gravity = checked_array("gravity", gravity, (3,))
+        gravity = maths.checked_array("gravity", gravity, (3,))
         # Before the bodies are prepared, which makes new ones.
         twins = twins_of(bodies)
         bodies, contacts = prepared(bodies, contacts, timestep, gravity)
@@ -146,19 +164,19 @@ class Scene(eqx.Module):
 
     def __str__(self) -> str:
         """What notebooks show, as text."""
-        traced = any(is_traced(body.mass, body.mass_scale) for body in self.bodies) or is_traced(
+        traced = any(maths.is_traced(body.mass, body.mass_scale) for body in self.bodies) or maths.is_traced(
             self.timestep
         )
         if traced:
             return repr(self)
         # Within a function that is being traced, too, the numbers of a scene that is not are known.
         with jax.ensure_compile_time_eval():
-            return plain(*self._summary(drawn=False))
+            return notebook.plain(*self._summary(drawn=False))
 
     def _repr_html_(self) -> str:
         """What notebooks show: bodies with mass and size, and what may touch."""
         title, rows, head = self._summary(drawn=True)
-        return card(title, rows, head=head)
+        return notebook.card(title, rows, head=head)
 
     def _summary(self, *, drawn: bool) -> tuple[str, list[tuple[str, ...]], tuple[str, ...]]:
         """Title, rows and head of the table of a scene."""
@@ -167,7 +185,7 @@ class Scene(eqx.Module):
             drawing = ""
             if drawn and body.surface is not None:
                 points = np.asarray(body.scale)[:, None] * np.asarray(body.surface.points[:3])
-                drawing = cloud(points.T, np.asarray(body.surface.vectors).T, 56, 150)
+                drawing = notebook.cloud(points.T, np.asarray(body.surface.vectors).T, 56, 150)
             mass = "fixed" if body.fixed else f"{float(body.mass) * float(body.mass_scale):.4g} kg"
             rows.append((drawing, body.name, mass, f"{body.size:.4g} m"))
         named = ", ".join(f"{a} – {b}" for a, b in self.pairs[:12])
@@ -196,13 +214,13 @@ class Scene(eqx.Module):
         loops, com = self._with_centres(self.loops)
         return loops_of(self.names, loops, com)
 
-    def _with_centres(self, parts: Parts) -> tuple[Parts, Float[AnyArray, "n 3"]]:
+    def _with_centres(self, parts: Parts) -> tuple[Parts, Float[maths.AnyArray, "n 3"]]:
         """Joints or loops, and the centres of mass of all bodies [m, F]."""
         places = [(body.com, body.com_offset) for body in self.bodies]
-        if not is_traced(parts, places):
-            parts, places = on_host((parts, places))
+        if not maths.is_traced(parts, places):
+            parts, places = maths.on_host((parts, places))
         rows = [com + offset for com, offset in places]
-        return parts, library(*rows).stack(rows).astype(self.timestep.dtype)
+        return parts, maths.library(*rows).stack(rows).astype(self.timestep.dtype)
 
     @property
     def driven(self) -> bool:
@@ -290,7 +308,7 @@ class Scene(eqx.Module):
         """
         return self.contacts[self.contact_index(a, b)].params
 
-    def replace_contact(self, a: str, b: str, **changes: Numbers) -> "Scene":
+    def replace_contact(self, a: str, b: str, **changes: maths.Numbers) -> "Scene":
         """The scene with some parameters of one contact changed, e.g. ``sliding_friction=0.3``.
 
         Raises:
@@ -312,7 +330,7 @@ class Scene(eqx.Module):
             is_leaf=lambda x: x is None,
         )
 
-    def replace_material(self, name: str, **changes: Numbers) -> "Scene":
+    def replace_material(self, name: str, **changes: maths.Numbers) -> "Scene":
         """The scene with some parameters of a body's material changed, e.g. ``sliding_friction=0.3``.
 
         It concerns the pairs of `others`.
@@ -343,7 +361,7 @@ class Scene(eqx.Module):
             of_edges = of_edges._replace(**{key: getattr(of_edges, key).at[i].set(value[i])})
         return eqx.tree_at(lambda s: s.others.of_edges, scene, of_edges)
 
-    def replace_body(self, name: str, **changes: Numbers) -> "Scene":
+    def replace_body(self, name: str, **changes: maths.Numbers) -> "Scene":
         """The scene with some of a body's `mass, inertia, com, mass_scale, com_offset` changed.
 
         Raises:
@@ -357,19 +375,19 @@ class Scene(eqx.Module):
         keys = list(changes)
         values = [
             _as_leaf(
-                checked_array(key, changes[key], getattr(self.bodies[i], key).shape),
+                maths.checked_array(key, changes[key], getattr(self.bodies[i], key).shape),
                 getattr(self.bodies[i], key),
             )
             for key in keys
         ]
         for key, value in zip(keys, values, strict=True):
-            if key in ("mass", "mass_scale") and not is_traced(value) and not float(value) > 0:
+            if key in ("mass", "mass_scale") and not maths.is_traced(value) and not float(value) > 0:
                 raise ValueError(f"{key} must be > 0, got {float(value)}")
             if key == "inertia":
                 checked_inertia(key, value)
         return eqx.tree_at(lambda s: [getattr(s.bodies[i], key) for key in keys], self, values)
 
-    def replace_joint(self, child: str, **changes: Numbers | Motor | None) -> "Scene":
+    def replace_joint(self, child: str, **changes: maths.Numbers | Motor | None) -> "Scene":
         """The scene with some of a joint's numbers changed: all but its bodies, its kind and what it mimics.
 
         Args:
@@ -391,7 +409,7 @@ class Scene(eqx.Module):
         joints = (*self.joints[:i], dataclasses.replace(self.joints[i], **changes), *self.joints[i + 1 :])
         return dataclasses.replace(self, joints=joints)
 
-    def initial_state(self, states: ByName | None = None, /, **bodies: Mapping[str, Numbers]) -> State:
+    def initial_state(self, states: ByName | None = None, /, **bodies: Mapping[str, maths.Numbers]) -> State:
         """A state: bodies by keyword, each a dict of `position, orientation, velocity, omega`.
 
         `position` is that of the centre of mass. In its place `origin` is that of the body's field frame, the
@@ -444,7 +462,7 @@ class Scene(eqx.Module):
 
     def _doubts_of(self, state: State, given: ByName | None) -> list[Doubt]:
         """Of a state alone; see `doubts`."""
-        if is_traced(state, self.timestep):
+        if maths.is_traced(state, self.timestep):
             return []
         placed = set(self.names)
         if given is not None:
@@ -463,7 +481,7 @@ class Scene(eqx.Module):
             ValueError: If the state does not fit the scene.
         """
         self.check_state(state)
-        return by_numpy(filled)(self.chains, state, self.timestep) if self.joints else state
+        return maths.by_numpy(filled)(self.chains, state, self.timestep) if self.joints else state
 
     def distance(self, state: State, a: str, b: str) -> Distance:
         """Signed distance of two bodies [m], nearest points and normal, see `dano.distance`; for one state.
@@ -476,11 +494,11 @@ class Scene(eqx.Module):
         solids, poses = [], []
         for i in (self.index(a), self.index(b)):
             body, turn = self.bodies[i], places.orientation[i]
-            arm = quat_rotate(turn, body.centre_of_mass.astype(turn.dtype))
+            arm = maths.quat_rotate(turn, body.centre_of_mass.astype(turn.dtype))
             geometry = body.shape if body.object is None else body.object
             assert geometry is not None
             solids.append(geometry)
-            poses.append(Pose(places.position[i] - arm, turn))
+            poses.append(maths.Pose(places.position[i] - arm, turn))
         return distance(*solids, pose_a=poses[0], pose_b=poses[1])
 
     def impact_duration(self, a: str, b: str, speed: float) -> float:
@@ -510,7 +528,7 @@ class Scene(eqx.Module):
             ValueError: If the state is not a `State`, or not one of this scene's bodies.
         """
         self._check_bodies(state)
-        return by_numpy(joint_values)(self.chains, state)
+        return maths.by_numpy(joint_values)(self.chains, state)
 
     def frames(self, state: State) -> Frames:
         """Pose, twist and Jacobian of every body, for one state.
@@ -522,7 +540,7 @@ class Scene(eqx.Module):
             ValueError: If the state does not fit the scene.
         """
         self.check_state(state)
-        return Frames(*by_numpy(frames_of)(self.chains, state))
+        return Frames(*maths.by_numpy(frames_of)(self.chains, state))
 
     def check_weighed(self) -> None:
         """Check that all masses are known, as steps and forces need it.
@@ -553,16 +571,18 @@ class Scene(eqx.Module):
             if value is None or value.shape != expected:
                 got = None if value is None else value.shape
                 raise ValueError(f"state.{key} must have shape {expected}, got {got}")
-            if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
-                raise ValueError(f"state.{key} must be finite, got {shown(np.asarray(value).tolist())}")
-        if not is_traced(state.orientation):
+            if not maths.is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
+                raise ValueError(
+                    f"state.{key} must be finite, got {checks.shown(np.asarray(value).tolist())}"
+                )
+        if not maths.is_traced(state.orientation):
             norms = np.linalg.norm(np.asarray(state.orientation), axis=-1)
             if np.any(np.abs(norms - 1) > 1e-3):
                 raise ValueError(f"state.orientation must hold unit quaternions, got norms {norms.tolist()}")
 
     def _check_bodies(self, state: State) -> None:
         """Check what a state says of bodies."""
-        checked_kind("state", state, State)
+        checks.checked_kind("state", state, State)
         if state.names is not None and state.names != self.names:
             raise ValueError(
                 f"state must be of a scene with the bodies {list(self.names)} in this order, got one of"
@@ -575,10 +595,12 @@ class Scene(eqx.Module):
                 raise ValueError(
                     f"state.{key} must have shape (…, {len(self.bodies)}, {size}), got {value.shape}"
                 )
-            if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
-                raise ValueError(f"state.{key} must be finite, got {shown(np.asarray(value).tolist())}")
+            if not maths.is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
+                raise ValueError(
+                    f"state.{key} must be finite, got {checks.shown(np.asarray(value).tolist())}"
+                )
 
-    def control(self, controls: ByName | None = None, /, **bodies: Mapping[str, Numbers]) -> Control:
+    def control(self, controls: ByName | None = None, /, **bodies: Mapping[str, maths.Numbers]) -> Control:
         """Control for one step: bodies by keyword, each a dict of `force` [N, W] and `torque` [N m, W].
 
         Bodies on joints may have `effort`, the torque [N m] or force [N] of the joint, and where a motor
@@ -604,3 +626,51 @@ class Scene(eqx.Module):
 
 def _as_leaf(value: Array, like: Array) -> Array:
     return value.astype(like.dtype)
+
+
+def pulls(scene: Scene) -> Float[Array, "n 3"]:
+    """Gravitational acceleration of each body [m/s²]."""
+    return _pulls([body.gravcomp for body in scene.bodies], scene.gravity)
+
+
+@maths.by_numpy
+def _pulls(compensated: Sequence[maths.Q | None], gravity: Float[maths.Q, "3"]) -> Float[maths.Q, "n 3"]:
+    xp = maths.library(gravity, *(share for share in compensated if share is not None))
+    left = [xp.asarray(1.0 if x is None else 1 - x, gravity.dtype) for x in compensated]
+    return xp.stack(left)[:, None] * gravity[None]
+
+
+def lifted(scene: Scene, control: Control | None, *leading: int) -> Control | None:
+    """A control with the forces that compensate weights; the same where none is compensated.
+
+    Args:
+        scene: The scene.
+        control: None for none.
+        *leading: Axes before those of the bodies.
+    """
+    if all(body.gravcomp is None for body in scene.bodies):
+        return control
+    masses = [(body.mass, body.mass_scale) for body in scene.bodies]
+    given = None if control is None else control.force
+    force, still = _lifting(masses, pulls(scene), scene.gravity, given, leading)
+    if control is None:
+        control = Control(still, still)
+    return dataclasses.replace(control, force=force)
+
+
+@maths.by_numpy
+def _lifting(
+    masses: Sequence[tuple[maths.Q, maths.Q]],
+    pull: Float[maths.Q, "n 3"],
+    gravity: Float[maths.Q, "3"],
+    force: Float[maths.Q, "*t n 3"] | None,
+    leading: tuple[int, ...],
+) -> tuple[Float[maths.Q, "*t n 3"], Float[maths.Q, "*t n 3"]]:
+    """Forces with those that compensate weights, and none."""
+    xp = maths.library(
+        pull, gravity, *(x for each in masses for x in each), *([] if force is None else [force])
+    )
+    mass = xp.stack([mass * scale for mass, scale in masses]).astype(pull.dtype)
+    lift = mass[:, None] * (pull - gravity[None])
+    still = xp.zeros((*leading, *lift.shape) if force is None else force.shape, pull.dtype)
+    return (still if force is None else force) + xp.broadcast_to(lift, still.shape), still

@@ -30,7 +30,6 @@ from dano.scene_file._parts import (
     part_of as part_of,
     parts_of as parts_of,
 )
-from dano.scene_file._pieces import run_piece as run_piece
 from dano.scene_file._reading import (
     load_scene as load_scene,
     parse_scene as parse_scene,
@@ -40,6 +39,7 @@ from dano.scene_file._runs import (
     drop_scene as drop_scene,
     load_run as load_run,
     Run as Run,
+    run_piece as run_piece,
     save_run as save_run,
 )
 from dano.scene_file._schedule import Schedule as Schedule

@@ -12,8 +12,8 @@ from dano.names import see
 from dano.progress import Progress
 from dano.scene import Body, Scene, State
 from dano.scene_file._forecast import bounds, fast_spin, Finding, forecast, starts, too_fast
-from dano.scene_file._pieces import run_piece
 from dano.scene_file._reading import SceneFile
+from dano.scene_file._runs import run_piece
 
 _PIECE = 20
 """Steps that are timed together: so few that what happens in a scene is not averaged out."""

@@ -2,6 +2,8 @@
 
 Speeds are bounded from the initial state: a body falls from where it starts to the lowest fixed body that it
 may touch, v = √(v₀² + 2 g H), or for all of the simulated time if there is none.
+
+What is odd about an object that was built of a field, or about a run that a file asks for, in words.
 """
 
 import math
@@ -11,9 +13,115 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dano.contact import CentroidLaw, DistributedLaw, Patch
+from dano.contact import CentroidLaw, DistributedLaw, Patch, STANDARD_GRAVITY
+from dano.fields import AbstractField, GridField
 from dano.names import see
-from dano.scene import Body, box_volume, Contact, RESOLVED, Scene, State
+from dano.objects import NeuralObject
+from dano.scene import Body, box_volume, Contact, Doubt, RESOLVED, Scene, State
+from dano.scene_file._schedule import Schedule
+
+_ROUNDED = 1e-6
+"""Share of a duration by which steps may miss it unsaid: rounding."""
+
+_MOST_WEIGHTS = 1e4
+"""Weights of a body beyond which a force on it is doubted."""
+
+_SHORT, _LONG = 1e-3, 5.0
+"""Sizes [m] beyond which an object is rather in other units than so large or small."""
+
+
+def mass_doubt(made: NeuralObject, dashes: str) -> str:
+    """What to say where no mass was given."""
+    return (
+        f"no mass was given: the object has {float(made.mass.mass):.3g} kg by the default, 1 kg per unit of"
+        f" density and cubic metre; give {dashes}mass or {dashes}mass{'-' if dashes else '_'}scale"
+    )
+
+
+def size_doubts(size: float, option: str) -> list[str]:
+    """What to say of a size [m], if it hints at other units than metres.
+
+    Args:
+        size: Longest extent of an object.
+        option: Name of the option that takes the right one.
+    """
+    if _SHORT <= size <= _LONG:
+        return []
+    likely = f" ({size / 1000:.3g} if it is in millimetres)" if size > _LONG else ""
+    return [
+        f"the object is {size:.3g} m long; if its field is not in metres, give {option}, its longest"
+        f" extent [m]{likely}"
+    ]
+
+
+def border_doubts(field: AbstractField, points: np.ndarray) -> list[str]:
+    """What to say of a grid that ends within the object.
+
+    Args:
+        field: What the object was made of.
+        points: Points on its surface [m, F], shape (n, 3).
+    """
+    if not isinstance(field, GridField):
+        return []
+    origin, spacing = np.asarray(field.origin, np.float64), np.asarray(field.spacing, np.float64)
+    last = origin + spacing * (np.array(field.shape) - 1)
+    # The density of a node on the border falls to zero over the next cells: only there is surface beyond it.
+    below = np.min(points - origin, axis=0) < -0.2 * spacing
+    above = np.max(points - last, axis=0) > 0.2 * spacing
+    sides = [f"−{axis}" for axis, cut in zip("xyz", below, strict=True) if cut]
+    sides += [f"+{axis}" for axis, cut in zip("xyz", above, strict=True) if cut]
+    if not sides:
+        return []
+    return [
+        f"the object is cut off where its grid ends, at {', '.join(sides)}; take a larger part of the field,"
+        " as with a larger crop (`dano import --crop`)"
+    ]
+
+
+def file_doubts(
+    scene: Scene, state: State, schedule: Schedule | None, n_steps: int, asked: float | None
+) -> list[Doubt]:
+    """What to say of a run: that controls begin too late, that its length is rounded, that bodies fall.
+
+    Args:
+        scene: The scene.
+        state: Where the run begins.
+        schedule: Controls.
+        n_steps: Steps of the run.
+        asked: Its length by the file [s], if that says one.
+    """
+    h, found = float(scene.timestep), []
+    duration = h * n_steps
+    starts = [] if schedule is None else np.asarray(schedule.start, np.float64).tolist()
+    for i, start in enumerate(starts):
+        if start >= duration:
+            text = (
+                f"[[controls]] {i + 1} never acts: it begins at {start:.4g} s, and {duration:.4g} s are run"
+            )
+            found.append(Doubt(2, text))
+    found += [] if schedule is None else _of_forces(scene, schedule)
+    if asked is not None and abs(duration - asked) > _ROUNDED * asked:
+        text = f"duration {asked:.6g} s is no whole number of steps of {h:.6g} s: {duration:.6g} s are run"
+        found.append(Doubt(3, text))
+    if len(scene.bodies) > 1:
+        limits = bounds(scene, scene.filled(state), duration)
+        found += [Doubt(2, finding.text) for finding in support(scene, limits)]
+    return found
+
+
+def _of_forces(scene: Scene, schedule: Schedule) -> list[Doubt]:
+    """Forces that are thousands of times a body's weight."""
+    found = []
+    for i, (row, force) in enumerate(zip(schedule.body.tolist(), np.asarray(schedule.force), strict=True)):
+        body, size = scene.bodies[row], float(np.linalg.norm(force))
+        weight = float(body.mass * body.mass_scale) * STANDARD_GRAVITY
+        if not body.fixed and size > _MOST_WEIGHTS * weight:
+            text = (
+                f"[[controls]] {i + 1} pushes {body.name!r} with {size:.3g} N, {size / weight:.2g} times its"
+            )
+            found.append(Doubt(2, f"{text} weight on earth: is it in newtons?"))
+    return found
+
 
 _STEPS_AN_IMPACT = 20
 """Steps that a spring needs to turn an impact round (see `DistributedLaw`)."""
@@ -39,7 +147,7 @@ class Finding(NamedTuple):
     text: str
 
 
-class Bound(NamedTuple):
+class SpeedBound(NamedTuple):
     """Largest motion of a body, see the module."""
 
     speed: float  # Of its centre of mass [m/s]
@@ -47,7 +155,7 @@ class Bound(NamedTuple):
     falls: bool  # Whether nothing that it may touch is fixed below it
 
 
-def bounds(scene: Scene, state: State, duration: float) -> list[Bound]:
+def bounds(scene: Scene, state: State, duration: float) -> list[SpeedBound]:
     """Largest motion of each body, from the initial state and the height that it can fall."""
     gravity = np.asarray(scene.gravity, np.float64)
     strength = float(np.linalg.norm(gravity))
@@ -55,7 +163,7 @@ def bounds(scene: Scene, state: State, duration: float) -> list[Bound]:
     for i, body in enumerate(scene.bodies):
         speed, spin = (float(np.linalg.norm(np.asarray(x[i]))) for x in (state.velocity, state.omega))
         if body.fixed or i not in scene.layout.free or strength == 0.0:
-            found.append(Bound(0.0 if body.fixed else speed, 0.0 if body.fixed else spin, False))
+            found.append(SpeedBound(0.0 if body.fixed else speed, 0.0 if body.fixed else spin, False))
             continue
         down = gravity / strength
         partners = _fixed_partners(scene, i)
@@ -63,7 +171,7 @@ def bounds(scene: Scene, state: State, duration: float) -> list[Bound]:
         falls = not heights
         gained = strength * duration if falls else 0.0
         reached = speed + gained if falls else math.sqrt(speed**2 + 2 * strength * min(heights))
-        found.append(Bound(reached, spin, falls))
+        found.append(SpeedBound(reached, spin, falls))
     return found
 
 
@@ -99,7 +207,7 @@ def _height(scene: Scene, state: State, i: int, other: int, down: np.ndarray) ->
     return max(inside, 0.0) / closing if is_above and closing > 0.05 else None
 
 
-def forecast(scene: Scene, state: State, limits: list[Bound]) -> list[Finding]:
+def forecast(scene: Scene, state: State, limits: list[SpeedBound]) -> list[Finding]:
     """What will not be resolved, from numbers alone."""
     return [
         *support(scene, limits),
@@ -111,7 +219,7 @@ def forecast(scene: Scene, state: State, limits: list[Bound]) -> list[Finding]:
     ]
 
 
-def support(scene: Scene, limits: list[Bound]) -> list[Finding]:
+def support(scene: Scene, limits: list[SpeedBound]) -> list[Finding]:
     """Bodies that touch nothing, or have nothing below."""
     touched = {name for pair in scene.pairs for name in pair}
     found = []
@@ -148,7 +256,7 @@ def fast_spin(name: str, verb: str, spin: float, h: float) -> Finding:
     )
 
 
-def _pair(scene: Scene, state: State, contact: Contact, limits: list[Bound]) -> list[Finding]:
+def _pair(scene: Scene, state: State, contact: Contact, limits: list[SpeedBound]) -> list[Finding]:
     a, b = scene.index(contact.a), scene.index(contact.b)
     return [*_impact(scene, contact, limits[a].speed + limits[b].speed), *_wall(scene, contact, limits)]
 
@@ -197,7 +305,7 @@ def _impact(scene: Scene, contact: Contact, speed: float) -> list[Finding]:
     ]
 
 
-def _wall(scene: Scene, contact: Contact, limits: list[Bound]) -> list[Finding]:
+def _wall(scene: Scene, contact: Contact, limits: list[SpeedBound]) -> list[Finding]:
     h = float(scene.timestep)
     a, b = (scene.index(name) for name in (contact.a, contact.b))
     way = (limits[a].speed + limits[b].speed) * h

@@ -18,8 +18,9 @@ from dano.building import BuildOptions
 from dano.checks import checked_items, checked_kind, checked_number, checked_path, shown
 from dano.fields import AbstractShape, load_field, scaled, SignedDistanceGrid
 from dano.keys import seed_key
+from dano.maths import rigidly_joined
 from dano.objects import MassProperties, NeuralObject
-from dano.scene_file._doubts import size_doubts
+from dano.scene_file._forecast import size_doubts
 from dano.scene_file._objects import Progress
 
 _OVERLAPS = 0.1
@@ -325,12 +326,7 @@ def _weight(part: Part, shape: AbstractShape, options: BuildOptions) -> _Weight:
 
 def _sum(weights: Sequence[_Weight], dtype) -> MassProperties:
     """Mass properties of rigidly joined parts (parallel-axis theorem)."""
-    mass = sum(weight.mass for weight in weights)
-    com = sum((weight.mass * weight.com for weight in weights), np.zeros(3)) / mass
-    inertia = np.zeros((3, 3))
-    for weight in weights:
-        arm = weight.com - com
-        inertia += weight.inertia + weight.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    mass, com, inertia = rigidly_joined(*(np.array([weight[k] for weight in weights]) for k in range(3)))
     errors = [np.sqrt(sum(np.asarray(weight.errors[k]) ** 2 for weight in weights)) for k in range(3)]
     return MassProperties(
         jnp.asarray(mass, dtype),

@@ -1,4 +1,7 @@
-"""Reading scene files. Their keys are described in docs/scenes.md."""
+"""Reading scene files. Their keys are described in docs/scenes.md.
+
+Robots of scene files.
+"""
 
 import dataclasses
 import functools
@@ -23,7 +26,7 @@ from dano.maths import is_traced, Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
 from dano.objects import MassModel, NeuralObject
-from dano.robots import close_loops, Robot
+from dano.robots import close_loops, load_mjcf, load_urdf, Robot
 from dano.scene import (
     Body,
     coming_from,
@@ -43,7 +46,7 @@ from dano.scene import (
     touching_pairs,
     Trajectory,
 )
-from dano.scene_file._doubts import file_doubts
+from dano.scene_file._forecast import file_doubts
 from dano.scene_file._objects import (
     is_shipped,
     load_asset,
@@ -52,12 +55,94 @@ from dano.scene_file._objects import (
     object_of_file,
     Progress,
 )
-from dano.scene_file._robots import common_gravity, read_robots, robot_files
 from dano.scene_file._schedule import read_schedule, Schedule
-from dano.scene_file._table import located, Table
+from dano.scene_file._table import is_number, located, Table
 
 if TYPE_CHECKING:
     from dano.vision import LearnedField, PosedCamera
+
+
+_FORMATS = {"urdf": load_urdf, "mjcf": load_mjcf}
+_KEYS = (*_FORMATS, "base", "prefix", "collision", "ignore", "balance_inertia", "joints")
+
+
+def read_robots(top: Table, folder: Path) -> list[tuple[Robot, dict[str, float]]]:
+    """The robots of a scene file, and where their joints start.
+
+    Raises:
+        ValueError: If a table is wrong, or a robot's file is.
+    """
+    return [
+        _robot(Table(f"{top.where}: [[robots]] {i + 1}", row, _KEYS), folder)
+        for i, row in enumerate(top.tables("robots"))
+    ]
+
+
+def robot_files(data: dict[str, Any], folder: Path) -> list[Path]:
+    """The files of the robots of a scene file."""
+    return [
+        folder / Path(row[kind]).expanduser()
+        for row in data.get("robots", [])
+        for kind in _FORMATS
+        if kind in row
+    ]
+
+
+def common_gravity(where: str, robots: Sequence[Robot]) -> tuple[float, float, float] | None:
+    """Gravity of the robots' files [m/s²]; None if they have none.
+
+    Raises:
+        ValueError: If two have different ones.
+    """
+    given = {robot.gravity: robot.name for robot in robots if robot.gravity is not None}
+    if len(given) > 1:
+        (a, first), (b, second) = list(given.items())[:2]
+        raise ValueError(
+            f"{where}: gravity must be given where robots have different ones, got {a} of {first!r} and"
+            f" {b} of {second!r}"
+        )
+    return next(iter(given), None)
+
+
+def _words(table: Table, key: str) -> list[str]:
+    words = table.data.get(key, [])
+    words = [words] if isinstance(words, str) else words
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise ValueError(f"{table.where}: {key} must be a list of strings, got {words!r}")
+    return words
+
+
+def _robot(table: Table, folder: Path) -> tuple[Robot, dict[str, float]]:
+    kinds = [kind for kind in _FORMATS if kind in table]
+    if len(kinds) != 1:
+        raise ValueError(f"{table.where}: needs exactly one of {', '.join(_FORMATS)}, got {kinds or 'none'}")
+    path = folder / Path(table.word(kinds[0])).expanduser()
+    base: Pose | str | None = None
+    if isinstance(table.data.get("base"), str):
+        base = table.word("base", ("floating",))
+    elif "base" in table:
+        place = table.table("base", ("position", "orientation"))
+        base = Pose(
+            place.vector("position", 3, (0.0,) * 3), place.vector("orientation", 4, (1.0, 0.0, 0.0, 0.0))
+        )
+    prefix = table.word("prefix") if "prefix" in table else ""
+    with located(table.where):
+        robot = _FORMATS[kinds[0]](
+            path,
+            base=base,
+            prefix=prefix,
+            # Words and tables of them are checked where they are read.
+            collision=table.data.get("collision", True),
+            ignore=_words(table, "ignore"),
+            balance_inertia=table.boolean("balance_inertia", False),
+        )
+        robot.check_simulated()
+        joints = table.table("joints", list(robot.joint_names)).data
+        for name, value in joints.items():
+            if not is_number(value):
+                raise ValueError(f"joints: {name} must be a finite number [rad or m], got {value!r}")
+    return robot, {name: float(value) for name, value in joints.items()}
+
 
 _STATE = {**STATE_SIZES, "origin": 3, "spin_world": 3}
 _GEOMETRY = ("object", "field", "asset", "shape")
@@ -220,15 +305,9 @@ def parse_scene(
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path} must be a TOML scene file: {error}") from error
     top = Table(str(path), data, _TOP)
-    asked = None if timestep is None else checked_number("timestep", timestep, above=0, unit="s")
-    h = top.number("timestep", 0.01) if asked is None else asked
-    if not (math.isfinite(h) and h > 0):
-        raise ValueError(f"{path}: timestep must be finite and > 0 s, got {h}")
+    h, steps = _time(top, path, timestep, n_steps)
     if "camera" in top:
         top.word("camera")
-    steps = _steps(top, h) if n_steps is None else n_steps
-    if steps < 1:
-        raise ValueError(f"{path}: n_steps must be ≥ 1, got {steps}")
     tables = top.tables("bodies")
     robots = read_robots(top, path.parent)
     usual = None
@@ -266,18 +345,38 @@ def parse_scene(
         if loops:
             # Coordinates that the file gives stay as they are.
             state = close_loops(scene, state, [name for name, given in start.items() if "q" in given])
-    objects = {
-        row["name"]: row["asset"] if "asset" in row else _source(path.parent, row["object"])
-        for row in tables
-        if "asset" in row or "object" in row
-    }
     schedule = read_schedule(top, scene)
-    made = SceneFile(scene, state, int(steps), schedule, path, text, objects, default_law)
+    made = SceneFile(scene, state, int(steps), schedule, path, text, _objects(tables, path), default_law)
     asked = top.number("duration") if n_steps is None and "duration" in top else None
     say_doubts(
         [*scene.doubts(state, start), *file_doubts(scene, state, schedule, int(steps), asked)], stacklevel=3
     )
     return made
+
+
+def _objects(tables: Sequence[dict[str, Any]], path: Path) -> dict[str, str | Path]:
+    """What neural objects are made of, by the names of their bodies."""
+    return {
+        row["name"]: row["asset"] if "asset" in row else _source(path.parent, row["object"])
+        for row in tables
+        if "asset" in row or "object" in row
+    }
+
+
+def _time(top: Table, path: Path, timestep: float | None, n_steps: int | None) -> tuple[float, int | float]:
+    """The step [s], and how many there are.
+
+    Raises:
+        ValueError: If one is out of range.
+    """
+    asked = None if timestep is None else checked_number("timestep", timestep, above=0, unit="s")
+    h = top.number("timestep", 0.01) if asked is None else asked
+    if not (math.isfinite(h) and h > 0):
+        raise ValueError(f"{path}: timestep must be finite and > 0 s, got {h}")
+    steps = _steps(top, h) if n_steps is None else n_steps
+    if steps < 1:
+        raise ValueError(f"{path}: n_steps must be ≥ 1, got {steps}")
+    return h, steps
 
 
 def _steps(top: Table, timestep: float) -> int | float:

@@ -1,20 +1,51 @@
-"""Saved runs that remember their scene, and the scene of an object that is simply dropped."""
+"""Saved runs that remember their scene, and the scene of an object that is simply dropped.
+
+A scene simulated piece by piece: what a command measures, reports on, or joins to a whole run.
+"""
 
 import json
 import math
 import os
+import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from dano.archive import checked_input
+from dano.engine import simulate
 from dano.maths import Pose
 from dano.objects import NeuralObject
-from dano.scene import Scene, Trajectory
+from dano.scene import Scene, State, Trajectory
 from dano.scene_file._objects import is_shipped, load_object, Progress
 from dano.scene_file._reading import parse_scene, SceneFile
 from dano.scene_file._table import located
+
+
+def run_piece(loaded: SceneFile, state: State, start: float, n_steps: int) -> tuple[Trajectory, float]:
+    """Simulate some steps of a scene; nothing is warned of.
+
+    Steps that did not converge are marked in the trajectory, so that they can be reported all together.
+
+    Args:
+        loaded: The scene and its controls.
+        state: Where the piece begins.
+        start: Time of that in the whole run, which controls are read at [s].
+        n_steps: Steps of the piece.
+
+    Returns:
+        The piece, and the wall-clock time that it took, with compiling if it was not compiled yet [s].
+    """
+    controls = None if loaded.controls is None else loaded.controls.starting_at(start)
+    began = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        piece = simulate(loaded.scene, state, n_steps, controls=controls)
+    jax.block_until_ready(piece.states)
+    return piece, time.perf_counter() - began
+
 
 _LAW_BEFORE = "centroid"
 """Law of contacts that name none, in runs that were saved before runs said it."""

@@ -10,27 +10,15 @@ from typing import Any, cast
 
 import numpy as np
 
+from dano import planning
 from dano.archive import checked_input
 from dano.names import did_you_mean
-from dano.planning import (
-    Actuator,
-    FIRST_DRAWS,
-    Goal,
-    KINDS,
-    Limit,
-    Method,
-    METHODS,
-    PlanOptions,
-    QUANTITIES,
-    SamplingOptions,
-    Task,
-)
 from dano.scene import Scene
 from dano.scene_file._table import is_number, located, Table
 
 _TOP = ("duration", "n_steps", "actuators", "goals", "limits", "search")
 _ACTUATOR = ("body", "kind", "limit", "lower", "upper", "axes", "cost", "start")
-_GOAL = ("body", *QUANTITIES, "running", "final", "required", "within", "axes")
+_GOAL = ("body", *planning.QUANTITIES, "running", "final", "required", "within", "axes")
 _LIMIT = ("body", "quantity", "lower", "upper", "axes")
 _SAMPLING = ("passes", "samples", "knots", "deviation", "first")
 _SEARCH = ("method", "explore", "softening", "seed", "max_seconds", "max_iterations", *_SAMPLING)
@@ -51,10 +39,10 @@ class TaskFile:
         text: Its text.
     """
 
-    task: Task
+    task: planning.Task
     controls: np.ndarray
-    method: Method
-    options: PlanOptions
+    method: planning.Method
+    options: planning.PlanOptions
     path: Path
     text: str
 
@@ -85,7 +73,7 @@ def load_task(path: str | os.PathLike[str], scene: Scene) -> TaskFile:
     goals = [_goal(table, scene) for table in _rows(top, "goals", _GOAL)]
     limits = [_limit(table, scene) for table in _rows(top, "limits", _LIMIT)]
     with located(str(source)):
-        task = Task(n_steps, [actuator for actuator, _ in read], goals, limits)
+        task = planning.Task(n_steps, [actuator for actuator, _ in read], goals, limits)
         task.check(scene)
     start = np.concatenate([first for _, first in read], axis=1)
     return TaskFile(task, start, *_search(top), source, text)
@@ -130,15 +118,15 @@ def _numbers(table: Table, key: str) -> Any:
     return tuple(float(x) for x in value) if isinstance(value, list) else float(value)
 
 
-def _actuator(table: Table, scene: Scene, times: np.ndarray) -> tuple[Actuator, np.ndarray]:
+def _actuator(table: Table, scene: Scene, times: np.ndarray) -> tuple[planning.Actuator, np.ndarray]:
     """An actuator, and the first guess of its controls at all times [s]."""
     body = _body(table, scene)
-    kind = table.word("kind", list(KINDS), "force")
-    if KINDS[kind] == 1 and "axes" in table:
+    kind = table.word("kind", list(planning.KINDS), "force")
+    if planning.KINDS[kind] == 1 and "axes" in table:
         raise ValueError(f"{table.where}: {'an' if kind == 'effort' else 'a'} {kind} has no axes")
     options = {key: _numbers(table, key) for key in ("limit", "lower", "upper") if key in table}
     with located(table.where):
-        actuator = Actuator(
+        actuator = planning.Actuator(
             body, kind, axes=table.word("axes", None, "xyz"), cost=table.number("cost", 1e-4), **options
         )
         return actuator, _start(table, actuator.size, times)
@@ -161,36 +149,37 @@ def _start(table: Table, size: int, times: np.ndarray) -> np.ndarray:
     return np.broadcast_to(start, (times.size, size))
 
 
-def _goal(table: Table, scene: Scene) -> Goal:
+def _goal(table: Table, scene: Scene) -> planning.Goal:
     body = _body(table, scene)
-    quantities = [key for key in QUANTITIES if key in table]
+    quantities = [key for key in planning.QUANTITIES if key in table]
     if len(quantities) != 1:
         raise ValueError(
-            f"{table.where}: needs exactly one of {', '.join(QUANTITIES)}, got {quantities or 'none'}"
+            f"{table.where}: needs exactly one of {', '.join(planning.QUANTITIES)}, got"
+            f" {quantities or 'none'}"
         )
     name = quantities[0]
-    n = QUANTITIES[name]
+    n = planning.QUANTITIES[name]
     value: Any = table.number(name) if n == 1 else table.vector(name, n)
     numbers = {key: table.number(key) for key in ("running", "final", "within") if key in table}
     with located(table.where):
         axes, required = table.word("axes", None, "xyz"), table.boolean("required", True)
         given: dict[str, Any] = {name: value}
-        return Goal(body, required=required, axes=axes, **numbers, **given)
+        return planning.Goal(body, required=required, axes=axes, **numbers, **given)
 
 
-def _limit(table: Table, scene: Scene) -> Limit:
+def _limit(table: Table, scene: Scene) -> planning.Limit:
     body = _body(table, scene)
     bounds = {key: _numbers(table, key) for key in ("lower", "upper") if key in table}
     if not bounds:
         raise ValueError(f"{table.where}: needs lower, upper, or both")
     with located(table.where):
-        return Limit(body, table.word("quantity"), axes=table.word("axes", None, "xyz"), **bounds)
+        return planning.Limit(body, table.word("quantity"), axes=table.word("axes", None, "xyz"), **bounds)
 
 
-def _search(top: Table) -> tuple[Method, PlanOptions]:
+def _search(top: Table) -> tuple[planning.Method, planning.PlanOptions]:
     """How a plan is searched for; what the table leaves out is as in Python."""
     table = top.table("search", _SEARCH)
-    method = cast(Method, table.word("method", METHODS, "ilqr"))
+    method = cast(planning.Method, table.word("method", planning.METHODS, "ilqr"))
     ilqr: dict[str, Any] = {}
     sampling: dict[str, Any] = {}
     options: dict[str, Any] = {"seed": table.integer("seed", 0)}
@@ -206,12 +195,14 @@ def _search(top: Table) -> tuple[Method, PlanOptions]:
     if "deviation" in table:
         sampling["deviation"] = table.number("deviation")
     if "first" in table:
-        sampling["first"] = table.word("first", FIRST_DRAWS)
+        sampling["first"] = table.word("first", planning.FIRST_DRAWS)
     if "explore" in table:
         options["explore"] = table.integer("explore", 0)
     if "softening" in table:
         softening = _numbers(table, "softening")
         options["softening"] = softening if isinstance(softening, tuple) else (softening,)
     with located(table.where):
-        drawn = SamplingOptions(**sampling)
-        return method, PlanOptions(ilqr=PlanOptions().ilqr._replace(**ilqr), sampling=drawn, **options)
+        drawn = planning.SamplingOptions(**sampling)
+        return method, planning.PlanOptions(
+            ilqr=planning.PlanOptions().ilqr._replace(**ilqr), sampling=drawn, **options
+        )

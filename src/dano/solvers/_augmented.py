@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from dano.solvers._ilqr import (
     CONVERGED,
     first_iterate,
-    Iterate,
+    IlqrIterate,
     minimise,
     Multipliers,
     rolled,
@@ -95,7 +95,7 @@ def optimal_trajectory(
     return _solved(problem, dual, iterate, options, watch)
 
 
-def _solved(problem, dual: Multipliers, iterate: Iterate, options: TrajectoryOptions, watch: "_Watch"):
+def _solved(problem, dual: Multipliers, iterate: IlqrIterate, options: TrajectoryOptions, watch: "_Watch"):
     n_done, hopeless, history, best = 0, 0, [], None
     before, tolerance = np.inf, max(options.tolerance, _FIRST_TOLERANCE if problem.constraints else 0.0)
     stop = TrajectoryStop.ITERATIONS
@@ -152,7 +152,7 @@ class _Best(NamedTuple):
     rank: tuple[float, float]
     cost: float
     worst: tuple[Violation, ...]
-    iterate: Iterate
+    iterate: IlqrIterate
     dual: Multipliers
 
 
@@ -165,7 +165,7 @@ class _Watch:
         self.problem, self.options, self.callback, self.began = problem, options, callback, began
         self.minimise, self.gapped = minimise, gapped
 
-    def minimised(self, dual, iterate: Iterate, tolerance: float, update: int):
+    def minimised(self, dual, iterate: IlqrIterate, tolerance: float, update: int):
         """The inner minimum, and why it was cut short, if it was."""
         precision = jnp.asarray(tolerance, iterate.value.dtype)
         end = int(iterate.iterations) + self.options.max_iterations
@@ -183,7 +183,7 @@ class _Watch:
             return iterate, TrajectoryStop.STOPPED
         return iterate, None
 
-    def looked(self, iterate: Iterate) -> tuple[float, tuple[Violation, ...]]:
+    def looked(self, iterate: IlqrIterate) -> tuple[float, tuple[Violation, ...]]:
         """J, and all violations, the worst first."""
         cost, rows = _looked(self.problem, iterate.states, iterate.controls, self.gapped)
         n_steps = iterate.controls.shape[0]
@@ -199,7 +199,7 @@ class _Watch:
             found.append(Violation(name, float(table[step, component]), place, int(component)))
         return float(cost), tuple(sorted(found, key=lambda v: -v.amount))
 
-    def _told(self, iterate: Iterate, update: int) -> Progress:
+    def _told(self, iterate: IlqrIterate, update: int) -> Progress:
         cost, worst = self.looked(iterate)
         return Progress(
             update,
@@ -214,7 +214,7 @@ class _Watch:
 
 
 @functools.cache
-def _compiled(options: tuple[tuple[str, bool], ...]) -> Callable[..., Iterate]:
+def _compiled(options: tuple[tuple[str, bool], ...]) -> Callable[..., IlqrIterate]:
     jit: Any = eqx.filter_jit  # whose signature does not list the options that it hands on
     return jit(minimise, compiler_options=dict(options)) if options else jit(minimise)
 
@@ -247,7 +247,7 @@ def _looked(problem: TrajectoryProblem, states, controls, gapped: bool):
 
 
 @eqx.filter_jit
-def _updated(problem: TrajectoryProblem, dual: Multipliers, iterate: Iterate, growth, most):
+def _updated(problem: TrajectoryProblem, dual: Multipliers, iterate: IlqrIterate, growth, most):
     values = constraint_values(problem, iterate.states, iterate.controls)
     new = tuple(
         pressed(c, value, multiplier, dual.penalty)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.solvers._box import box_minimum
+from dano.solvers._least_squares import box_minimum
 from dano.solvers._trajectory import (
     constraint_values,
     held,
@@ -56,34 +56,20 @@ class Policy(NamedTuple):
     K: Float[Array, "T m n"]
 
 
-class Iterate(NamedTuple):
-    """What goes around the loop.
+class IlqrIterate(NamedTuple):
+    """What goes around the loop."""
 
-    Attributes:
-        states: x.
-        controls: u.
-        value: L.
-        model: Around this trajectory, or the one before until it is renewed.
-        policy: Of the last backward pass.
-        rho: Regularisation ρ.
-        gap_weight: Weight of the gaps in the merit L + w Σ|d|.
-        fresh: Whether the model is of this trajectory.
-        slow: Steps in a row that brought less than the tolerance.
-        iterations: So far.
-        status: RUNNING, CONVERGED or STUCK.
-    """
-
-    states: Any
-    controls: Float[Array, "T m"]
-    value: Float[Array, ""]
-    model: Model
-    policy: Policy
-    rho: Float[Array, ""]
-    gap_weight: Float[Array, ""]
-    fresh: Bool[Array, ""]
-    slow: Int[Array, ""]
-    iterations: Int[Array, ""]
-    status: Int[Array, ""]
+    states: Any  # x
+    controls: Float[Array, "T m"]  # u
+    value: Float[Array, ""]  # L
+    model: Model  # Around this trajectory, or the one before until it is renewed
+    policy: Policy  # Of the last backward pass
+    rho: Float[Array, ""]  # Regularisation ρ
+    gap_weight: Float[Array, ""]  # Weight of the gaps in the merit L + w Σ|d|
+    fresh: Bool[Array, ""]  # Whether the model is of this trajectory
+    slow: Int[Array, ""]  # Steps in a row that brought less than the tolerance
+    iterations: Int[Array, ""]  # So far
+    status: Int[Array, ""]  # RUNNING, CONVERGED or STUCK
 
 
 class Multipliers(NamedTuple):
@@ -115,7 +101,7 @@ def rolled(problem: TrajectoryProblem, start: Any, controls: Array) -> Any:
     return jax.tree.map(lambda first, others: jnp.concatenate([first[None], others]), start, rest)
 
 
-def first_iterate(problem: TrajectoryProblem, multipliers: Multipliers, states, controls) -> Iterate:
+def first_iterate(problem: TrajectoryProblem, multipliers: Multipliers, states, controls) -> IlqrIterate:
     """A trajectory, with nothing known of it yet."""
     n_steps, m = controls.shape
     n = jax.eval_shape(problem.difference, indexed(states, 0), indexed(states, 0)).shape[0]
@@ -128,7 +114,7 @@ def first_iterate(problem: TrajectoryProblem, multipliers: Multipliers, states, 
     policy = Policy(jnp.zeros((n_steps, m), dtype), jnp.zeros((n_steps, m, n), dtype))
     zero, none = jnp.zeros((), dtype), jnp.asarray(0)
     value = lagrangian(problem, multipliers, states, controls)
-    return Iterate(
+    return IlqrIterate(
         states,
         controls,
         value,
@@ -146,14 +132,14 @@ def first_iterate(problem: TrajectoryProblem, multipliers: Multipliers, states, 
 def minimise(
     problem: TrajectoryProblem,
     multipliers: Multipliers,
-    iterate: Iterate,
+    iterate: IlqrIterate,
     tolerance: Float[Array, ""],
     most: Int[Array, ""],
-) -> Iterate:
+) -> IlqrIterate:
     """Iterate until L is at a minimum, or `most` more iterations are done."""
     last = iterate.iterations + most
 
-    def unfinished(i: Iterate) -> Array:
+    def unfinished(i: IlqrIterate) -> Array:
         return (i.status == RUNNING) & (i.iterations < last)
 
     # As `dano.maths.product`, for all products in here.
@@ -163,7 +149,9 @@ def minimise(
         )
 
 
-def _iteration(problem: TrajectoryProblem, multipliers: Multipliers, i: Iterate, tolerance) -> Iterate:
+def _iteration(
+    problem: TrajectoryProblem, multipliers: Multipliers, i: IlqrIterate, tolerance
+) -> IlqrIterate:
     # A step that failed leaves the trajectory, so also its model, as it is.
     model = jax.lax.cond(i.fresh, lambda: i.model, lambda: _model(problem, multipliers, i.states, i.controls))
     policy, good = _backward(problem, model, i.controls, i.policy.k, i.rho)
@@ -198,7 +186,9 @@ def _iteration(problem: TrajectoryProblem, multipliers: Multipliers, i: Iterate,
     return _updated(i, model, policy, found, taken, good & small, weight, merit, gap, tolerance)
 
 
-def _updated(i: Iterate, model, policy, found, taken, small, weight, merit, gap, tolerance) -> Iterate:
+def _updated(
+    i: IlqrIterate, model, policy, found, taken, small, weight, merit, gap, tolerance
+) -> IlqrIterate:
     alpha, states, controls, value, _ = found
     brought = merit - value - (1 - alpha) * weight * gap
     little = brought <= tolerance * (1 + jnp.abs(value))
@@ -214,7 +204,7 @@ def _updated(i: Iterate, model, policy, found, taken, small, weight, merit, gap,
     def chosen(new, old):
         return jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
 
-    return Iterate(
+    return IlqrIterate(
         chosen(states, i.states),
         chosen(controls, i.controls),
         chosen(value, i.value),

@@ -46,7 +46,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 State = PyTree[Array]
 
@@ -282,8 +282,3 @@ def total_cost(problem: TrajectoryProblem, states: Any, controls: Array) -> Floa
     inner = jax.tree.map(lambda x: x[:-1], states)
     stages = jax.vmap(problem.stage_cost)(inner, controls, jnp.arange(controls.shape[0]))
     return jnp.sum(stages) + problem.final_cost(indexed(states, -1))
-
-
-def finite_rows(tree: Any) -> Bool[Array, ""]:
-    """Whether every number is finite."""
-    return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))

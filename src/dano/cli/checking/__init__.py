@@ -1,3 +1,3 @@
 """`dano check`."""
 
-from dano.cli.checking._arguments import Check as Check
+from dano.cli.checking._arguments import CheckScene as CheckScene

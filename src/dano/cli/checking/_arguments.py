@@ -7,19 +7,12 @@ from tyro.conf import Positional
 
 
 @dataclass(frozen=True)
-class Check:
-    """Say what a scene will do before a long run: contact law, step, what is not resolved, what it costs.
+class CheckScene:
+    """Say what a scene will do before a long run: contact law, step, what is not resolved, what it costs."""
 
-    Attributes:
-        scene: A scene file (.toml), or a neural object (.dano) that would be dropped onto a floor.
-        steps: Number of steps; default: the scene's.
-        timestep: Timestep [s]; default: the scene's.
-        seconds: Run steps for this long to measure them [s].
-        json: Print one JSON object instead of text.
-    """
-
+    # A scene file (.toml), or a neural object (.dano) that would be dropped onto a floor.
     scene: Positional[Path]
-    steps: int | None = None
-    timestep: float | None = None
-    seconds: float = 3.0
-    json: bool = False
+    steps: int | None = None  # Number of steps; default: the scene's
+    timestep: float | None = None  # Timestep [s]; default: the scene's
+    seconds: float = 3.0  # Run steps for this long to measure them [s]
+    json: bool = False  # Print one JSON object instead of text

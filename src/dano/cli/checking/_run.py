@@ -6,7 +6,7 @@ import warnings
 from dano import scene_file
 from dano.cli._console import Progress, put, put_json
 from dano.cli._scenes import load
-from dano.cli.checking._arguments import Check
+from dano.cli.checking._arguments import CheckScene
 
 _INDENT = " " * 12
 _UNITS = {
@@ -19,7 +19,7 @@ _UNITS = {
 }
 
 
-def check(command: Check) -> None:
+def check(command: CheckScene) -> None:
     """See `dano check --help`."""
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")

@@ -1,33 +1,206 @@
-"""`dano identify`."""
+"""`dano identify`.
+
+`dano identify` of what a wrist holds.
+The film that a fit is of: how the command names it, and what its pixels said.
+"""
 
 import json
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dano import scene_file
 from dano.archive import checked_output, write_text
-from dano.cli._console import Progress, put, put_json, say
+from dano.cli._console import numbers, Progress, put, put_json, say
 from dano.cli._interrupt import interrupted
-from dano.cli._outputs import missing_for_pictures
+from dano.cli._outputs import chosen, missing_for_pictures
 from dano.cli.identifying._arguments import Identify
-from dano.cli.identifying._load import identify_held, LOGS
+from dano.cli.tracking import filming
 from dano.identification import (
     Errors,
     Identification,
     identify as fit_parameters,
+    identify_load,
     IdentifyOptions,
+    Load,
     load_motion,
+    load_wrist_log,
     Motion,
+    Parameter,
     parameter_of,
 )
+from dano.pixels import FilmFit, identify_in_film
 from dano.scene import Scene
 from dano.solvers import Stop
+from dano.vision import Film, LearnedField, PosedCamera
 
-if TYPE_CHECKING:
-    from dano.cli.identifying._film import Seen
+LOGS = (".csv", ".txt")
+"""Endings of logs of a wrist's sensor, which stand where a scene does otherwise."""
+
+
+def identify_held(command: Identify) -> None:
+    """Mass, centre and inertia of the load of a log; see `dano identify --help`.
+
+    Raises:
+        ValueError: If arguments of scenes are given, too, the log cannot be read, or see `identify_load`.
+    """
+    alien = {
+        "motions": command.motions,
+        "parameter": command.parameter,
+        "report": command.report,
+        "held-out": command.held_out,
+        "video": command.video,
+    }
+    if given := [name for name, value in alien.items() if value]:
+        raise ValueError(f"{command.scene} is the log of a wrist's sensor: leave out {', '.join(given)}")
+    if command.output is not None:
+        if command.output.suffix.lower() != ".json":
+            raise ValueError(f"output must be a .json file, got {command.output}")
+        checked_output(command.output)
+    options = {"rate": command.rate, "time_unit": command.time_unit, "length_unit": command.length_unit}
+    log = load_wrist_log(command.scene, frame=command.frame, **options)
+    found = identify_load(log)
+    result = {"log": str(command.scene), "rows": len(log.times), **_numbers(found)}
+    if command.output is not None:
+        write_text(command.output, json.dumps(result, indent=2, ensure_ascii=False) + "\n")
+    if command.json:
+        put_json(result)
+    else:
+        _tell_load(found, command)
+    for message in found.messages:
+        say(f"warning: {message}")
+
+
+def _numbers(found: Load) -> dict[str, Any]:
+    """Values with errors; null where the log does not decide."""
+    values = {name: _plain(getattr(found, name)) for name in ("mass", "centre", "inertia")}
+    return {
+        **values,
+        "standard_errors": {name: _plain(value) for name, value in found.standard_errors.items()},
+        "force_bias": found.force_bias.tolist(),
+        "torque_bias": found.torque_bias.tolist(),
+        "drift": found.drift.tolist(),
+        "force_noise": found.force_noise,
+        "torque_noise": found.torque_noise,
+        "unobserved": list(found.unobserved),
+        "messages": list(found.messages),
+    }
+
+
+def _plain(value: Any) -> Any:
+    array = np.asarray(value, dtype=object)
+    array[~np.isfinite(np.asarray(value, np.float64))] = None
+    return array.tolist()
+
+
+def _tell_load(found: Load, command: Identify) -> None:
+    errors = found.standard_errors
+    put(f"load            of {command.scene}, in the sensor's frame, with standard errors")
+    if "mass" in found.unobserved:
+        put("mass            not observed")
+    else:
+        put(f"mass            {found.mass:.6g} ± {float(errors['mass']):.2g} kg")
+    if "centre" in found.unobserved:
+        put("centre of mass  not observed")
+    else:
+        put(f"centre of mass  {numbers(found.centre.tolist())} ± {errors['centre'].max():.2g} m")
+    if "inertia" in found.unobserved:
+        put("inertia         not observed")
+    else:
+        for i, row in enumerate(found.inertia):
+            error = f" ± {errors['inertia'].max():.2g} kg m² about it" if i == 0 else ""
+            put(f"{'inertia' if i == 0 else '':<15} {numbers(row.tolist())}{error}")
+    put(f"bias            {numbers(found.force_bias.tolist())} N, {numbers(found.torque_bias.tolist())} N m")
+    put(f"noise           {found.force_noise:.3g} N, {found.torque_noise:.3g} N m")
+    if command.output is not None:
+        put(f"\nwrote {command.output}")
+
+
+class Seen(NamedTuple):
+    """A film, what is in it, from where it was taken, and what its pixels said."""
+
+    film: Film
+    look: LearnedField
+    camera: PosedCamera
+    found: FilmFit
+
+    def numbers(self, command: Identify) -> dict[str, Any]:
+        """What pixels said, beside the poses."""
+        poses, tracked = self.found.poses, self.found.tracked
+        return {
+            "file": str(command.video),
+            "from_poses": {name: np.asarray(value).tolist() for name, value in poses.values.items()},
+            "from_poses_standard_errors": {
+                name: np.asarray(value).tolist() for name, value in poses.standard_errors.items()
+            },
+            "passes": len(self.found.history) - 1,
+            "settled": self.found.settled,
+            "frames": len(tracked.status),
+            "frames_used": tracked.n_tracked,
+            "colour_error": float(np.nanmedian(tracked.colour_error)),
+            "lamps": [
+                {"towards": np.asarray(lamp.place).tolist(), "power": np.asarray(lamp.colour).tolist()}
+                for lamp in self.found.lamps
+            ],
+        }
+
+    def tell(self) -> None:
+        """Print it."""
+        poses, tracked = self.found.poses, self.found.tracked
+        put(
+            f"film        pixels of {tracked.n_tracked} of {len(tracked.status)} frames,"
+            f" {len(self.found.history) - 1} passes{'' if self.found.settled else ', not settled'};"
+            " from the poses alone:"
+        )
+        for name, value in poses.values.items():
+            if np.ndim(value) == 0:
+                put(f"{name:<32.32} {value:12.6g} {poses.standard_errors[name]:15.3g}")
+
+
+def film_of(command: Identify) -> Callable[..., Seen]:
+    """What fits the pixels of the film that the command names.
+
+    Raises:
+        ValueError: If the film lacks something, or is of several motions.
+    """
+    video = command.video
+    assert video is not None
+    if command.look is None:
+        raise ValueError("video needs --look: what `dano train` wrote of the body in it")
+    if len(command.motions) != 1:
+        raise ValueError(f"video must be that of the one motion, got {len(command.motions)} motions")
+    if command.resume:
+        raise ValueError("resume goes on with fits of poses only: leave out --resume, or --video")
+    filming.check_camera(command.filming)
+    look = filming.look_of(command.look, "look")
+
+    def fit(
+        scene: Scene,
+        motion: Motion,
+        chosen: Sequence[Parameter],
+        progress: Progress,
+        settings: dict[str, Any],
+    ) -> Seen:
+        film = filming.filmed(command.filming, video, command.rate, progress)
+        camera = filming.camera_of(command.filming, film)
+        found = identify_in_film(
+            scene,
+            film,
+            look,
+            camera,
+            motion,
+            chosen,
+            tracking=filming.options_of(command.filming),
+            background=command.filming.background,
+            progress=progress,
+            **settings,
+        )
+        return Seen(film, look, camera, found)
+
+    return fit
 
 
 def identify(command: Identify) -> None:
@@ -38,7 +211,6 @@ def identify(command: Identify) -> None:
     fit_pixels = None
     if command.video is not None:
         # Here, because most fits are of poses.
-        from dano.cli.identifying._film import film_of
 
         fit_pixels = film_of(command)
     options = _options(command, kept)
@@ -129,15 +301,7 @@ def _noise(command: Identify) -> dict[str, float] | None:
 
 def _options(command: Identify, kept: Path | None) -> IdentifyOptions:
     """How the search runs; one of pixels is not kept."""
-    return IdentifyOptions(
-        window=command.window,
-        continuity=command.continuity,
-        huber=command.huber,
-        independent=command.independent,
-        starts=command.starts,
-        checkpoint=kept if command.video is None else None,
-        resume=command.resume,
-    )
+    return chosen(IdentifyOptions, command, checkpoint=kept if command.video is None else None)
 
 
 def _write_report(command: Identify, fit: Identification, seen: "Seen | None") -> None:

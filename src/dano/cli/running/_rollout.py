@@ -1,7 +1,17 @@
-"""A rollout with progress and timing, and what it came to in numbers."""
+"""A rollout with progress and timing, and what it came to in numbers.
 
+What a long run has simulated so far, in a file beside its output: a killed run goes on with it.
+Where the time of a command goes, part by part.
+"""
+
+import hashlib
 import math
+import os
+import sys
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,20 +19,147 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from dano import __version__
+from dano.archive import WorkInProgress
 from dano.cli._console import Progress, put, say
-from dano.cli.running._checkpoint import Checkpoint
-from dano.cli.running._clock import Clock
 from dano.engine import contact_history
 from dano.names import see
-from dano.scene import (
-    JOINT_QUANTITIES,
-    Layout,
-    Scene,
-    state_arrays,
-    STATE_SIZES,
-    Trajectory,
-)
+from dano.scene import JOINT_QUANTITIES, Layout, Scene, State, state_arrays, STATE_SIZES, Trajectory
 from dano.scene_file import run_piece, SceneFile, too_fast
+
+_FORM = "dano-checkpoint", 1
+_REPORTED = ("residuals", "iterations", "converged")
+
+
+class RunCheckpoint:
+    """Pieces of a run on disk.
+
+    Attributes:
+        file: Where they are kept; its path is None where the output is not a file.
+    """
+
+    def __init__(self, output: Path, loaded: SceneFile):
+        """A checkpoint of a run; nothing is written yet."""
+        regular = not output.exists() or output.is_file()
+        self.file = WorkInProgress(
+            output.with_name(f"{output.stem}.checkpoint.npz") if regular else None,
+            _FORM,
+            _digest(loaded),
+            "this scene, with the same step, number of steps and version of dano: remove it, or run without"
+            " --resume",
+        )
+        self._names = loaded.scene.names
+
+    def read(self) -> list[Trajectory]:
+        """The pieces that an earlier run has left; none if there is no file.
+
+        Raises:
+            ValueError: If the file is not a checkpoint, or one of another run.
+        """
+        data = self.file.read()
+        if data is None:
+            return []
+        count = int(data["pieces"])
+        return [
+            self._piece({name: data[f"{name}_{i}"] for name in self._members(data)}) for i in range(count)
+        ]
+
+    def keep(self, pieces: Sequence[Trajectory], *, now: bool = False) -> bool:
+        """Write the pieces, if it is time to, or at once; whether they were written."""
+        if not (now or self.file.due()):
+            return False
+        arrays = {
+            f"{name}_{i}": value
+            for i, piece in enumerate(pieces)
+            for name, value in (
+                *state_arrays(piece.states).items(),
+                *((name, getattr(piece, name)) for name in _REPORTED),
+            )
+        }
+        return self.file.write({"pieces": len(pieces), **arrays})
+
+    def remove(self) -> None:
+        """Remove the file: the run is complete."""
+        self.file.remove()
+
+    @staticmethod
+    def _members(data: dict[str, np.ndarray]) -> list[str]:
+        joints = JOINT_QUANTITIES if "q_0" in data else ()
+        return [*STATE_SIZES, *joints, *_REPORTED]
+
+    def _piece(self, data: dict[str, np.ndarray]) -> Trajectory:
+        arrays = {name: jnp.asarray(data[name]) for name in data if name not in _REPORTED}
+        states = State(**arrays, names=self._names)
+        reported = {name: jnp.asarray(data[name]) for name in _REPORTED}
+        # Times are those of the whole run, made when the pieces are joined.
+        times = jnp.zeros(len(states.position))
+        return Trajectory(times, states, names=self._names, **reported)
+
+
+def _digest(loaded: SceneFile) -> str:
+    """What decides the numbers of a run: the scene, its state and controls, and how many steps."""
+    said = hashlib.sha256(f"{__version__} {loaded.n_steps} {loaded.text}".encode())
+    for leaf in jax.tree.leaves((loaded.scene, loaded.state, loaded.controls)):
+        array = np.asarray(leaf)
+        said.update(f"{array.dtype} {array.shape}".encode())
+        said.update(np.ascontiguousarray(array).tobytes())
+    return said.hexdigest()
+
+
+class Clock:
+    """Wall time in parts that add up to the whole: one begins where the one before ends."""
+
+    def __init__(self, first: str = "starting", *, since_start: bool = False):
+        """Begin the first part.
+
+        Args:
+            first: What it is called.
+            since_start: Begin when the process did, where the system says when that was.
+        """
+        self._parts: dict[str, float] = {}
+        self._part = first
+        self._began = time.monotonic() - (_age() if since_start else 0.0)
+
+    def __call__(self, part: str) -> None:
+        """End the part that runs and begin another, or go on with it."""
+        now = time.monotonic()
+        self._parts[self._part] = self._parts.get(self._part, 0.0) + now - self._began
+        self._part, self._began = part, now
+
+    def move(self, seconds: float, part: str, to: str) -> None:
+        """Count some seconds of a part as those of another."""
+        self._parts[part] = self._parts.get(part, 0.0) - seconds
+        self._parts[to] = self._parts.get(to, 0.0) + seconds
+
+    def parts(self) -> dict[str, float]:
+        """Seconds of each part until now, in the order in which they began."""
+        self(self._part)
+        return dict(self._parts)
+
+    def told(self) -> str:
+        """The sum and its parts, in words; what took less than a twentieth of a second is left out."""
+        parts = self.parts()
+        named = [f"{part} {seconds:.1f}" for part, seconds in parts.items() if seconds >= 0.05]
+        return f"took {sum(parts.values()):.1f} s: {', '.join(named)}"
+
+
+def is_program() -> bool:
+    """Whether this process is the command itself, and not another program that calls it."""
+    return os.path.basename(sys.argv[0]) == "dano"
+
+
+def _age() -> float:
+    """How long this process has run [s]; 0 where the system does not say."""
+    if not sys.platform.startswith("linux"):
+        return 0.0
+    try:
+        with open("/proc/self/stat", encoding="ascii") as file:
+            # The name of the program, in brackets, may hold spaces; the start is the 20th word behind it.
+            ticks = int(file.read().rpartition(")")[2].split()[19])
+        return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK"))
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
 
 # A rollout is run in so many pieces or more: progress can be shown, and an interrupt is heard, between two.
 PIECES = 20
@@ -45,7 +182,7 @@ def roll_out(
     loaded: SceneFile,
     progress: Progress,
     clock: Clock,
-    kept: Checkpoint | None = None,
+    kept: RunCheckpoint | None = None,
     *,
     resume: bool = False,
 ) -> Rollout:

@@ -4,19 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dano import vision
+from dano.cli._outputs import chosen
 from dano.cli.tracking._arguments import Filming
 from dano.progress import Progress
 from dano.scene_file import asset_look
-from dano.vision import (
-    Camera,
-    Film,
-    LearnedField,
-    load_camera,
-    PosedCamera,
-    read_film,
-    steady_film,
-    TrackOptions,
-)
 
 
 def check_camera(filming: Filming) -> None:
@@ -32,9 +24,9 @@ def check_camera(filming: Filming) -> None:
         )
 
 
-def filmed(filming: Filming, video: Path, rate: float | None, progress: Progress) -> Film:
+def filmed(filming: Filming, video: Path, rate: float | None, progress: Progress) -> vision.Film:
     """The frames of a video or a folder, as if the camera had kept the direction of the first one."""
-    film = read_film(
+    film = vision.read_film(
         video,
         rate=rate,
         slow_motion=filming.slow_motion,
@@ -45,20 +37,12 @@ def filmed(filming: Filming, video: Path, rate: float | None, progress: Progress
         occluders=filming.occluders,
         progress=progress,
     )
-    return steady_film(film, camera_of(filming, film), filming.background, filming.readout)
+    return vision.steady_film(film, camera_of(filming, film), filming.background, filming.readout)
 
 
-def options_of(filming: Filming) -> TrackOptions:
+def options_of(filming: Filming) -> vision.TrackOptions:
     """How frames are compared with the object."""
-    return TrackOptions(
-        masks=filming.mask_source,
-        loss=filming.loss,
-        rays=filming.rays,
-        shutter=filming.shutter,
-        readout=filming.readout,
-        table=filming.table,
-        seed=filming.seed,
-    )
+    return chosen(vision.TrackOptions, filming, masks=filming.mask_source)
 
 
 def focal_of(numbers: tuple[float, ...]) -> float | tuple[float, float] | None:
@@ -77,7 +61,7 @@ def focal_of(numbers: tuple[float, ...]) -> float | tuple[float, float] | None:
     raise ValueError(f"focal must be one number or two [pixels], got {len(numbers)}")
 
 
-def camera_of(filming: Filming, film: Film) -> PosedCamera:
+def camera_of(filming: Filming, film: vision.Film) -> vision.PosedCamera:
     """The camera that took a film.
 
     Raises:
@@ -86,14 +70,14 @@ def camera_of(filming: Filming, film: Film) -> PosedCamera:
     width, height = (n * film.shrunk for n in film.size)
     if filming.camera is not None:
         file, frame = named_frame(filming.camera)
-        return load_camera(file, width, height, frame=frame)
+        return vision.load_camera(file, width, height, frame=frame)
     assert filming.eye is not None
-    axes = Camera(filming.eye, filming.look_at, width=width, height=height).axes
+    axes = vision.Camera(filming.eye, filming.look_at, width=width, height=height).axes
     pose = np.concatenate([axes.T * np.array([1.0, 1.0, -1.0]), np.array(filming.eye)[:, None]], axis=1)
     k1, k2, p1, p2 = filming.distortion
     focal = focal_of(filming.focal)
     assert focal is not None
-    return PosedCamera(
+    return vision.PosedCamera(
         pose,
         focal=focal,
         width=width,
@@ -112,7 +96,7 @@ def named_frame(camera: Path) -> tuple[Path, str | None]:
     return Path(file), frame
 
 
-def look_of(name: str, argument: str) -> LearnedField:
+def look_of(name: str, argument: str) -> vision.LearnedField:
     """A learned object: from a file, or one that is shipped.
 
     Raises:
@@ -124,11 +108,11 @@ def look_of(name: str, argument: str) -> LearnedField:
         if look is not None:
             return look
     elif path.suffix.lower() == ".dano":
-        look = LearnedField.of_object(path)
+        look = vision.LearnedField.of_object(path)
         if look is not None:
             return look
     else:
-        return LearnedField.load(path)
+        return vision.LearnedField.load(path)
     raise ValueError(
         f"{argument} must have a learned look (a .dano or .field.npz file of `dano train`, or trained_bunny,"
         f" trained_soap), got {name}, which has none"

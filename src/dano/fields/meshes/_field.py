@@ -1,4 +1,7 @@
-"""Shapes from triangle meshes."""
+"""Shapes from triangle meshes.
+
+Winding numbers of closed meshes, and how nodes are marked by a mesh.
+"""
 
 import warnings
 from pathlib import Path
@@ -9,17 +12,80 @@ import numpy as np
 
 from dano.checks import checked_count, checked_number
 from dano.extras import DISTANCES
-from dano.fields._redistance import spread_distances
+from dano.fields._grid import degree_of
 from dano.fields._shapes import SolidMoments
-from dano.fields._signed_distance import SignedDistanceGrid
-from dano.fields._spline import degree_of
+from dano.fields._signed_distance import SignedDistanceGrid, spread_distances
 from dano.fields.meshes._reading import checked_units, read_mesh
 from dano.fields.meshes._repair import Repaired, repaired
-from dano.fields.meshes._winding import mark_nodes, winding_numbers
 from dano.memory import check_nodes
 
 if TYPE_CHECKING:
     import trimesh
+
+
+_STEP = 0.45
+"""Cells between points along and across a face that mark the nodes next to them."""
+
+_AT_ONCE = 1 << 21
+"""Points looked at together: some 100 MB."""
+
+
+def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How often a closed mesh winds around points: 1 inside a solid, 0 outside (whole numbers).
+
+    Solid angles of all faces, far ones by their moments (Barill et al., 2018), to less than a hundredth;
+    those of a mesh without a boundary sum to whole numbers. Points on the surface are on either side.
+
+    Args:
+        vertices: Shape (v, 3).
+        faces: Shape (f, 3); without a boundary, see `repaired`.
+        points: Shape (n, 3).
+    """
+    if not len(points) or not len(faces):
+        return np.zeros(len(points), int)
+    arrays = (np.ascontiguousarray(x, t) for x, t in ((vertices, float), (faces, np.int64), (points, float)))
+    return np.rint(DISTANCES.load().fast_winding_number(*arrays)).astype(int)
+
+
+def _counted(counts: np.ndarray) -> np.ndarray:
+    """0, 1, … for each count, one after the other."""
+    ends = np.cumsum(counts)
+    return np.arange(int(counts.sum())) - np.repeat(ends - counts, counts)
+
+
+def _batches(counts: np.ndarray) -> list[slice]:
+    """Slices of rows whose counts sum to about as much as is looked at together."""
+    ends = np.cumsum(counts)
+    cuts = np.searchsorted(ends, np.arange(_AT_ONCE, int(ends[-1]), _AT_ONCE)) + 1 if len(ends) else []
+    places = np.unique([0, *cuts, len(counts)])
+    return [slice(a, b) for a, b in zip(places[:-1], places[1:], strict=True)] or [slice(0, 0)]
+
+
+def mark_nodes(
+    vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, spacing: float, shape: np.ndarray
+) -> np.ndarray:
+    """Nodes of a grid next to points of a mesh, of which no point of its surface is further than 0.6 cells.
+
+    So no point of the surface is further than 1.5 cells from a marked node.
+    """
+    triangle = vertices[faces]
+    opposite = np.linalg.norm(np.roll(triangle, -1, axis=1) - np.roll(triangle, 1, axis=1), axis=2)
+    # From the corner that is opposite to the shortest edge, in steps along and across: slivers are many.
+    first = np.argmin(opposite, axis=1)
+    a, b, c = (triangle[np.arange(len(faces)), (first + k) % 3] for k in range(3))
+    along = np.ceil(opposite.max(axis=1) / (_STEP * spacing)).astype(int)
+    across = np.ceil(opposite.min(axis=1) / (_STEP * spacing)).astype(int)
+    along, across = np.maximum(along, 1), np.maximum(across, 1)
+    marked = np.zeros(shape, bool)
+    for some in _batches((along + 1) * (across + 1)):
+        count = (along[some] + 1) * (across[some] + 1)
+        face = np.repeat(np.arange(len(faces))[some], count)
+        i, j = np.divmod(_counted(count), across[face] + 1)
+        s, t = (i / along[face])[:, None], (j / across[face])[:, None]
+        points = a[face] + s * ((b - a)[face] + t * (c - b)[face])
+        marked[tuple(np.rint((points - origin) / spacing).astype(int).T)] = True
+    return marked
+
 
 _BYTES_PER_NODE = 120
 """Distances, where each was found, and what finding their spline takes."""

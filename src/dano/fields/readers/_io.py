@@ -1,10 +1,16 @@
-"""Reading fields from files of many kinds, and writing grids."""
+"""Reading fields from files of many kinds, and writing grids.
 
+Files that a file of a field or mesh refers to, and that are read with it.
+"""
+
+import json
 import re
+import struct
 from collections.abc import Callable
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -19,16 +25,58 @@ from dano.fields._signed_distance import SignedDistanceGrid
 from dano.fields.meshes import checked_units, mesh_field, MESH_SUFFIXES
 from dano.fields.readers._arrays import load_npy, load_npz, load_object
 from dano.fields.readers._instant_ngp import load_snapshot
-from dano.fields.readers._nerfacto import load_checkpoint
-from dano.fields.readers._splat_files import is_splats
-from dano.fields.readers._splats import load_splats
+from dano.fields.readers._nerfacto import beside, load_checkpoint, SETTINGS, TRANSFORMS
+from dano.fields.readers._splats import is_splats, load_splats
 from dano.fields.readers._torch_module import load_callable, load_module
 from dano.fields.readers._vdb import load_vdb
 from dano.maths import Numbers, Pose
 from dano.names import did_you_mean
 
+_GLB, _JSON = b"glTF", 0x4E4F534A
+"""How a binary glTF file begins, and the kind of its first chunk (glTF 2.0, 4.4)."""
 
-class _Reader(NamedTuple):
+
+def companion_files(path: Path) -> list[Path]:
+    """Files beside one that reading it reads, too, those that are missing included.
+
+    Materials of .obj, buffers of .gltf and .glb, what nerfstudio writes beside checkpoints. Pictures do not
+    count: they are no part of a shape.
+
+    Args:
+        path: A file, of a kind that `load_field` reads.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".ckpt":
+        return [place for name in (SETTINGS, TRANSFORMS) for place in beside(path, name)]
+    try:
+        names = (
+            _materials(path) if suffix == ".obj" else _buffers(path) if suffix in (".gltf", ".glb") else []
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error):
+        # What is wrong with the file is said by who reads it.
+        return []
+    return [path.parent / name for name in names]
+
+
+def _materials(path: Path) -> list[str]:
+    with open(path, encoding="utf-8", errors="replace") as file:
+        return [line.split(maxsplit=1)[1].strip() for line in file if line.startswith("mtllib ")]
+
+
+def _buffers(path: Path) -> list[str]:
+    with open(path, "rb") as file:
+        if file.read(4) == _GLB:
+            _, _, size, kind = struct.unpack("<4I", file.read(16))
+            data = file.read(size) if kind == _JSON else b"{}"
+        else:
+            file.seek(0)
+            data = file.read()
+    content: dict[str, Any] = json.loads(data)
+    places = [buffer.get("uri", "data:") for buffer in content.get("buffers", [])]
+    return [unquote(place) for place in places if not place.startswith("data:")]
+
+
+class _Format(NamedTuple):
     """How a kind of file is read."""
 
     read: Callable[..., AbstractField]  # Takes the path and the options
@@ -48,17 +96,17 @@ _CHECKPOINT = (
     "log2_hashmap_size",
     "disable_scene_contraction",
 )
-_MESH = _Reader(mesh_field, ("resolution", "interpolation", "edge", "up"))
-_SPLATS = _Reader(load_splats, ("min_width", "skip_nan", "box", "sphere"), crops=True)
-_READERS: dict[str, _Reader] = {
-    ".npz": _Reader(load_npz, ("interpolation",)),
-    ".npy": _Reader(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
-    ".dano": _Reader(load_object, ("interpolation",)),
+_MESH = _Format(mesh_field, ("resolution", "interpolation", "edge", "up"))
+_SPLATS = _Format(load_splats, ("min_width", "skip_nan", "box", "sphere"), crops=True)
+_READERS: dict[str, _Format] = {
+    ".npz": _Format(load_npz, ("interpolation",)),
+    ".npy": _Format(load_npy, ("spacing", "origin", "interpolation", "signed_distance")),
+    ".dano": _Format(load_object, ("interpolation",)),
     **dict.fromkeys(MESH_SUFFIXES, _MESH),
-    ".ckpt": _Reader(load_checkpoint, _CHECKPOINT, crops=True),
-    **dict.fromkeys((".ingp", ".msgpack"), _Reader(load_snapshot, ("cascade", "interpolation"), crops=True)),
-    **dict.fromkeys((".vdb", ".nvdb"), _Reader(load_vdb, ("grid", "interpolation"), crops=True)),
-    **dict.fromkeys((".pt", ".pth", ".pt2"), _Reader(load_module, ("module",), crops=True)),
+    ".ckpt": _Format(load_checkpoint, _CHECKPOINT, crops=True),
+    **dict.fromkeys((".ingp", ".msgpack"), _Format(load_snapshot, ("cascade", "interpolation"), crops=True)),
+    **dict.fromkeys((".vdb", ".nvdb"), _Format(load_vdb, ("grid", "interpolation"), crops=True)),
+    **dict.fromkeys((".pt", ".pth", ".pt2"), _Format(load_module, ("module",), crops=True)),
 }
 
 

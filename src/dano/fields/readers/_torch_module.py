@@ -57,7 +57,7 @@ def load_module(path: Path, *, crop: Numbers | None, module: str | None = None) 
             raise ValueError(f"{path}: its weights do not fit {module!r}: {error}") from error
         made.eval()
     try:
-        return CallableField(_Flat(made, torch), bounds, "torch")
+        return CallableField(_FlatModule(made, torch), bounds, "torch")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -77,7 +77,7 @@ def load_callable(name: str, *, crop: Numbers | None) -> CallableField:
     function: Any = imported(name)
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(function, torch.nn.Module):
-        function = _Flat(function.eval(), torch)
+        function = _FlatModule(function.eval(), torch)
         return CallableField(function, bounds, "torch")
     return CallableField(function, bounds)
 
@@ -106,7 +106,7 @@ def imported(name: str) -> Callable:
     return found
 
 
-class _Flat:
+class _FlatModule:
     """A torch module whose output of shape (n, 1) counts as (n,); hands its parameters on."""
 
     def __init__(self, module: Any, torch: Any):

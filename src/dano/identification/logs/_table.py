@@ -1,4 +1,8 @@
-"""Tables of text: what separates cells, where the names of columns stand, which cells are empty."""
+"""Tables of text: what separates cells, where the names of columns stand, which cells are empty.
+
+What columns of logs mean, by the names that people and programs give them.
+What logs get wrong, corrected where there is one way to read them; every guess is reported.
+"""
 
 import csv
 import re
@@ -8,6 +12,361 @@ from typing import NamedTuple
 
 import numpy as np
 
+TIME = "times"
+
+_UNITS = {
+    "s": 1.0,
+    "sec": 1.0,
+    "secs": 1.0,
+    "seconds": 1.0,
+    "ms": 1e-3,
+    "msec": 1e-3,
+    "us": 1e-6,
+    "µs": 1e-6,
+    "ns": 1e-9,
+    "nsec": 1e-9,
+    "m": 1.0,
+    "cm": 0.01,
+    "mm": 0.001,
+    "rad": 1.0,
+    "m/s": 1.0,
+    "m s^-1": 1.0,
+    "mm/s": 0.001,
+    "cm/s": 0.01,
+    "rad/s": 1.0,
+    "rad s^-1": 1.0,
+    "deg/s": 0.017453292519943295,
+}
+"""SI units in the units that names of columns state."""
+
+_TIMES = ("time", "times", "t", "timestamp", "timestamps", "stamp", "ts", "rosbagtimestamp", "epoch", "clock")
+_WHOLE, _REST = ("sec", "secs"), ("nsec", "nsecs", "nanosec", "nanosecs")
+_GROUPS = {
+    "position": ("position", "positions", "pos", "p", "translation", "trans", "location"),
+    "orientation": ("orientation", "orientations", "quaternion", "quat", "q", "rotation", "rot", "attitude"),
+    "velocity": ("linear", "velocity", "velocities", "vel", "v", "speed"),
+    "omega": ("angular", "omega", "gyro", "w", "rates"),
+}
+_SHORT = {
+    **{letter: ("position", i) for i, letter in enumerate("xyz")},
+    **{a + letter: ("position", i) for a in ("t", "p") for i, letter in enumerate("xyz")},
+    **{"q" + letter: ("orientation", i) for i, letter in enumerate("wxyz")},
+    **{"v" + letter: ("velocity", i) for i, letter in enumerate("xyz")},
+    **{"w" + letter: ("omega", i) for i, letter in enumerate("xyz")},
+}
+_SIZES = {"position": 3, "orientation": 4, "velocity": 3, "omega": 3}
+_LETTERS = {"position": "xyz", "orientation": ("qw", "qx", "qy", "qz"), "velocity": ("vx", "vy", "vz")}
+_LETTERS["omega"] = ("wx", "wy", "wz")
+_AROUND = (
+    "field",
+    "pose",
+    "twist",
+    "transform",
+    "msg",
+    "data",
+    "header",
+    "rs",
+    "r",
+    "s",
+    "body",
+    "world",
+    "rigid",
+)
+"""Words around a quantity that name no body."""
+
+
+class Columns(NamedTuple):
+    """Where a table has what."""
+
+    # Columns of the time [as stated by `time_unit`], then of its nanoseconds if they stand apart.
+    times: tuple[int, ...]
+    time_unit: float | None  # Seconds in the unit of the time that its name states; None if it states none
+    names: tuple[str, ...]  # Of the bodies; ("",) if there is one without a name
+    groups: dict[str, list[list[int] | None]]  # Columns of each quantity by body; None where a body has none
+    # SI units in the unit that the names of a quantity's columns state; absent if they state none.
+    unit: dict[str, float]
+    left_out: tuple[str, ...]  # Names of columns that mean nothing here
+
+
+class _Meaning(NamedTuple):
+    body: str
+    named: bool  # as "soap.x"; other words before a quantity may be a topic's
+    key: str
+    place: int
+    unit: float | None
+
+
+def understood(header: Sequence[str]) -> Columns:
+    """What the columns of a log mean.
+
+    Known are `time, x, y, z, qw, …, vx, …, wx, …` with or without the name of a body and a dot before them,
+    what ROS calls them (`field.pose.position.x`, `/topic/pose/orientation/w`), EuRoC (`q_RS_w []`) and TUM
+    (`tx`), and units in their names (`x [mm]`, `time_ms`).
+
+    Raises:
+        ValueError: If a quantity of a body is not complete.
+    """
+    times, time_unit = _times(header)
+    places: dict[tuple[str, str], dict[int, int]] = {}
+    units: dict[str, set[float]] = {}
+    known, named = set(times), False
+    for i, word in enumerate(header):
+        if i in known or (found := _meaning(word)) is None:
+            continue
+        group = places.setdefault((found.body, found.key), {})
+        if found.place in group:
+            continue
+        group[found.place] = i
+        known.add(i)
+        named = named or found.named
+        if found.unit is not None:
+            units.setdefault(found.key, set()).add(found.unit)
+    bodies = tuple(dict.fromkeys(body for body, _ in places))
+    if len(bodies) > 1:
+        # Columns without a name beside those of named bodies belong to nobody.
+        bodies = tuple(body for body in bodies if body)
+    groups: dict[str, list[list[int] | None]] = {}
+    for key, size in _SIZES.items():
+        rows: list[list[int] | None] = []
+        for body in bodies:
+            group = places.get((body, key), {})
+            if 0 < len(group) < size:
+                have = [header[i] for i in group.values()]
+                names = [f"{body}.{c}" if body else c for k, c in enumerate(_LETTERS[key]) if k not in group]
+                raise ValueError(f"must have all columns of the {key} beside {have}, {names} are missing")
+            rows.append([group[k] for k in range(size)] if group else None)
+        if any(row is not None for row in rows):
+            groups[key] = rows
+    if len(bodies) == 1 and not named:
+        bodies = ("",)
+    stated = {key: values.pop() for key, values in units.items() if len(values) == 1}
+    left = tuple(word for i, word in enumerate(header) if i not in known)
+    return Columns(times, time_unit, bodies, groups, stated, left)
+
+
+def _split(word: str) -> tuple[str, float | None, bool]:
+    """A name without its unit, the unit, and whether there are brackets at all."""
+    text = word.strip().lstrip("%#_ ").strip()
+    match = re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]", text)
+    if match:
+        return match[1].strip(), _UNITS.get(match[2].strip().lower().replace("·", " ")), True
+    name, _, ending = text.rpartition("_")
+    if name and ending.lower() in ("ms", "us", "ns", "mm", "cm", "s", "sec", "m"):
+        return name, _UNITS[ending.lower()], True
+    return text, None, False
+
+
+def _times(header: Sequence[str]) -> tuple[tuple[int, ...], float | None]:
+    """Columns that hold the time: that of a message's header before that of its arrival."""
+    found: list[tuple[int, int, float | None]] = []
+    whole: dict[str, dict[str, int]] = {}
+    for i, word in enumerate(header):
+        name, unit, _ = _split(word)
+        tokens = [token for token in re.split(r"[./:\s_]+", name.lower()) if token]
+        if not tokens:
+            continue
+        if tokens[-1] in _WHOLE + _REST and ("stamp" in tokens or "header" in tokens or len(tokens) == 1):
+            kind = "whole" if tokens[-1] in _WHOLE else "rest"
+            whole.setdefault(" ".join(tokens[:-1]), {})[kind] = i
+        elif tokens[-1] in _TIMES or "".join(tokens) in _TIMES:
+            rank = 0 if tokens[-1] == "stamp" else 1 if "".join(tokens) in _TIMES else 2
+            found.append((rank, i, unit))
+    for parts in whole.values():
+        if len(parts) == 2:
+            return (parts["whole"], parts["rest"]), 1.0
+    if not found:
+        return (), None
+    _, i, unit = min(found)
+    return (i,), unit
+
+
+def _meaning(word: str) -> _Meaning | None:
+    """What a column holds; None if that is not known."""
+    name, unit, _ = _split(word)
+    body, dot, last = name.rpartition(".")
+    if last.lower() in _SHORT and not _quantity(body):
+        key, place = _SHORT[last.lower()]
+        return _Meaning(body if dot else "", bool(dot), key, place, unit)
+    tokens = [token for token in re.split(r"[./:\s_]+", name) if token]
+    if len(tokens) < 2:
+        match = re.fullmatch(r"(pos|quat|vel|rot|omega)([wxyz])", name.lower())
+        if not match:
+            return None
+        tokens = [match[1], match[2]]
+    letter = tokens[-1].lower()
+    key = _quantity(" ".join(tokens[:-1]))
+    letters = "wxyz" if key == "orientation" else "xyz"
+    if key is None or letter not in letters or any("cov" in t.lower() for t in tokens):
+        return None
+    others = [t for t in tokens[:-1] if t.lower() not in _GROUPS[key] and t.lower() not in _AROUND]
+    others = [t for t in others if not any(t.lower() in group for group in _GROUPS.values())]
+    return _Meaning("/".join(others), False, key, letters.index(letter), unit)
+
+
+def _quantity(text: str) -> str | None:
+    """The quantity that words before a letter name: the last of them that does."""
+    for token in reversed(re.split(r"[./:\s_]+", text.lower())):
+        for key, words in _GROUPS.items():
+            if token in words:
+                return key
+    return None
+
+
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+LENGTH_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+_SLOWEST, _UNSURE = 5.0, 1.0
+"""Median step between rows [s] above which times are not seconds, and above which they may be none."""
+
+_STEPS = {"ms": 2e3, "us": 2e5, "ns": np.inf}
+"""Largest usual steps of 30 to 1000 frames a second or so, in each unit."""
+
+_EPOCH = 1e8
+"""Seconds: later than this is counted since 1970 (this is 1973)."""
+
+_JITTER = 10
+"""Steps by which a row may be late to be sorted back; more is another log."""
+
+_FAST, _FAR = 30.0, 20.0
+"""Speed [m/s] of a tenth of the frames from which positions are not metres; span [m] that is doubted."""
+
+_IDENTITY = 0.05
+"""Largest of the first two parts of quaternions that turn about the last axis, if these are x and y."""
+
+
+def mended_times(
+    stamps: np.ndarray, unit: float | None, first: int | float = 0
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Times in seconds that increase, and the rows that they belong to.
+
+    Args:
+        stamps: As they are in the log, shape (T,); NaN where there is none.
+        unit: Seconds in their unit; None: guessed from the steps.
+        first: What was taken from them already.
+
+    Returns:
+        Times [s]; the rows that stay, in order; what was corrected, in words.
+
+    Raises:
+        ValueError: If they jump back by more than late rows do.
+    """
+    notes = []
+    rows = np.flatnonzero(np.isfinite(stamps))
+    if len(rows) < len(stamps):
+        notes.append(f"{len(stamps) - len(rows)} rows have no time and are left out")
+    known = stamps[rows]
+    steps = np.diff(known)
+    step = float(np.median(np.abs(steps[steps != 0]))) if np.any(steps) else 1.0
+    late = np.maximum.accumulate(known) - known if len(known) else known
+    if late.max(initial=0) > _JITTER * step:
+        row = int(rows[np.argmax(late > _JITTER * step)])
+        raise ValueError(
+            f"times must increase, but row {row + 1} jumps back by {late.max():.6g}: two logs in one file, or"
+            " a clock that began again; split it"
+        )
+    if np.any(steps < 0):
+        notes.append(f"{int(np.sum(late > 0))} rows come late and are sorted by time")
+        order = np.argsort(known, kind="stable")
+        rows, known = rows[order], known[order]
+    again = np.concatenate([[False], np.diff(known) == 0])
+    if np.any(again):
+        notes.append(f"{int(again.sum())} rows repeat the time of the one before and are left out")
+        rows, known = rows[~again], known[~again]
+    if unit is None:
+        unit, said = _guessed_unit(step, known + first)
+        notes += said
+    if len(known) and abs(known[0] + first) * unit > _EPOCH:
+        notes.append("times are counted since 1970: now from the first row")
+        known = known - known[0]
+    elif first:
+        known = known + first
+    return known * unit, rows, notes
+
+
+def _guessed_unit(step: float, stamps: np.ndarray) -> tuple[float, list[str]]:
+    """Seconds in the unit of times: by their size where they are counted since 1970, else by their steps."""
+    size = float(np.abs(stamps).max(initial=0.0))
+    for name, factor in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
+        # From 2001 to 2100.
+        if 1e9 <= size * factor < 4.1e9:
+            said = f"times are read as {name} (they count since 1970); time_unit says otherwise"
+            return factor, [] if name == "s" else [said]
+    if step >= _SLOWEST:
+        name = next(name for name, largest in _STEPS.items() if step < largest)
+        return TIME_UNITS[name], [
+            f"times are read as {name}, because they step by {step:.6g}; time_unit says otherwise"
+        ]
+    if step >= _UNSURE and len(stamps) > 2:
+        return 1.0, [f"times step by {step:.6g} and are read as seconds; if they are ms, say time_unit='ms'"]
+    return 1.0, []
+
+
+def in_metres(times: np.ndarray, position: np.ndarray, unit: float | None) -> tuple[float, list[str]]:
+    """Metres in the unit of positions.
+
+    Args:
+        times: [s], shape (T,).
+        position: Shape (T, n, 3), NaN where it is unknown.
+        unit: What was stated; None: guessed from speeds.
+
+    Returns:
+        The factor, and what was guessed, in words.
+    """
+    if unit is not None:
+        return unit, []
+    speeds, spans = [0.0], [0.0]
+    for body in np.moveaxis(position, 1, 0):
+        seen = np.isfinite(body).all(axis=1)
+        if seen.sum() > 2:
+            steps = np.linalg.norm(np.diff(body[seen], axis=0), axis=1) / np.diff(times[seen])
+            speeds.append(float(np.quantile(steps, 0.9)))
+            spans.append(float(np.ptp(body[seen], axis=0).max()))
+    if max(speeds) > _FAST:
+        return 0.001, [
+            f"positions are read as mm, because they would move at {max(speeds):.4g} m/s; length_unit='m'"
+            " says otherwise"
+        ]
+    if max(spans) > _FAR:
+        return 1.0, [f"positions span {max(spans):.4g} m; if they are in mm, say length_unit='mm'"]
+    return 1.0, []
+
+
+def ordered_quaternions(quaternions: np.ndarray, order: str | None) -> tuple[np.ndarray, list[str]]:
+    """Quaternions as wxyz, shape (T, n, 4); zero ones, which trackers write where they see nothing, unknown.
+
+    Without an order they are taken as wxyz, unless the first two numbers are near zero all the time: such a
+    body turns about z if they are x and y, and would lie on its head if they were w and x.
+    """
+    notes = []
+    found = quaternions.copy()
+    empty = np.isfinite(found).all(axis=-1) & (np.linalg.norm(found, axis=-1) == 0)
+    if np.any(empty):
+        notes.append(f"{int(empty.sum())} quaternions are zero: taken as not observed")
+        found[empty] = np.nan
+    if order is None:
+        seen = found[np.isfinite(found).all(axis=-1)]
+        order = "wxyz"
+        if len(seen) and np.abs(seen[:, :2]).max() < _IDENTITY:
+            order = "xyzw"
+            notes.append("quaternions are read as xyzw, because they then turn about z; order says otherwise")
+    return (found[..., [3, 0, 1, 2]] if order == "xyzw" else found), notes
+
+
+def unwrapped(angles: np.ndarray) -> tuple[np.ndarray, int]:
+    """Angles [rad] without the jumps by 2π of logs that keep them within one turn, and how many there were.
+
+    Angles that span more than a turn are not kept within one, and stay.
+    """
+    seen = np.flatnonzero(np.isfinite(angles))
+    values = angles[seen]
+    if len(values) < 2 or np.ptp(values) > 2 * np.pi + 1e-3:
+        return angles, 0
+    turns = np.cumsum(np.concatenate([[0.0], -np.round(np.diff(values) / (2 * np.pi))]))
+    result = angles.copy()
+    result[seen] = values + 2 * np.pi * turns
+    return result, int(np.count_nonzero(np.diff(turns)))
+
+
 _EMPTY = ("", "nan", "na", "n/a", "null", "none", "-", "--", "?")
 """What stands in cells, in small letters, where nothing was measured."""
 
@@ -15,20 +374,13 @@ _TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 """Columns of trajectories of the TUM RGB-D benchmark, which have no header."""
 
 
-class Table(NamedTuple):
-    """Cells of a table as text.
+class LogTable(NamedTuple):
+    """Cells of a table as text."""
 
-    Attributes:
-        source: The file, for messages.
-        header: Names of the columns.
-        rows: Cells of each row.
-        lines: Number of the line in the file of each row.
-    """
-
-    source: Path
-    header: tuple[str, ...]
-    rows: list[list[str]]
-    lines: list[int]
+    source: Path  # The file, for messages
+    header: tuple[str, ...]  # Names of the columns
+    rows: list[list[str]]  # Cells of each row
+    lines: list[int]  # Number of the line in the file of each row
 
     def numbers(self, column: int) -> np.ndarray:
         """A column as numbers, NaN where cells are empty.
@@ -65,7 +417,7 @@ class Table(NamedTuple):
         return np.array(shifted), first
 
 
-def read_table(source: Path) -> Table:
+def read_table(source: Path) -> LogTable:
     """Read a table of text.
 
     Cells are separated by commas, semicolons (then numbers may have decimal commas), tabs or blanks. The
@@ -107,7 +459,7 @@ def read_table(source: Path) -> Table:
             raise ValueError(
                 f"{source}: row {k + 1} (line {i}) must hold {len(header)} cells, got {len(row)}"
             )
-    return Table(source, header, [row for _, row in rows], [i for i, _ in rows])
+    return LogTable(source, header, [row for _, row in rows], [i for i, _ in rows])
 
 
 def _separator(lines: Sequence[str]) -> str:

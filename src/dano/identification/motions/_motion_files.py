@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dano import checks
 from dano.archive import (
     Arrays,
     check_format,
@@ -19,16 +20,7 @@ from dano.archive import (
     TRAJECTORY,
     write_archive,
 )
-from dano.checks import checked_choice, checked_items, checked_kind, checked_number
-from dano.identification.logs import (
-    in_metres,
-    LENGTH_UNITS,
-    mended_times,
-    ordered_quaternions,
-    read_table,
-    TIME_UNITS,
-    understood,
-)
+from dano.identification import logs
 from dano.identification.motions._motion import Motion, QUANTITIES, UNNAMED
 
 _SYNONYMS = {
@@ -97,19 +89,19 @@ def load_motion(
     """
     source = checked_input(path)
     if order is not None:
-        checked_choice("order", order, ("wxyz", "xyzw"))
+        checks.checked_choice("order", order, ("wxyz", "xyzw"))
     if point is not None:
-        checked_choice("point", point, ("com", "origin"))
+        checks.checked_choice("point", point, ("com", "origin"))
     if rate is not None:
-        rate = checked_number("rate", rate, above=0)
+        rate = checks.checked_number("rate", rate, above=0)
     for name, value, units in (
-        ("time_unit", time_unit, TIME_UNITS),
-        ("length_unit", length_unit, LENGTH_UNITS),
+        ("time_unit", time_unit, logs.TIME_UNITS),
+        ("length_unit", length_unit, logs.LENGTH_UNITS),
     ):
         if value is not None:
-            checked_choice(name, value, list(units))
+            checks.checked_choice(name, value, list(units))
     if names is not None:
-        names = (names,) if isinstance(names, str) else checked_items("names", names, str)
+        names = (names,) if isinstance(names, str) else checks.checked_items("names", names, str)
     suffix = source.suffix.lower()
     if suffix not in (".npz", *_TABLES):
         raise ValueError(f"motion must be an .npz or .csv file, got {source}")
@@ -163,20 +155,20 @@ def _mend(
     times = np.asarray(arrays["times"], float)
     if times.ndim != 1 or len(times) < 2:
         return notes  # said by Motion.create
-    stated = read.time_unit if time_unit is None else TIME_UNITS[time_unit]
-    arrays["times"], rows, said = mended_times(times, stated, read.first)
+    stated = read.time_unit if time_unit is None else logs.TIME_UNITS[time_unit]
+    arrays["times"], rows, said = logs.mended_times(times, stated, read.first)
     notes += said
     for key in (*QUANTITIES, "covariance", "q"):
         if key in arrays and len(arrays[key]) == len(times):
             arrays[key] = arrays[key][rows]
     if "orientation" in arrays:
         turns = arrays["orientation"]
-        arrays["orientation"], said = ordered_quaternions(turns, read.order or order)
+        arrays["orientation"], said = logs.ordered_quaternions(turns, read.order or order)
         notes += said
-    length = read.units.get("position") if length_unit is None else LENGTH_UNITS[length_unit]
+    length = read.units.get("position") if length_unit is None else logs.LENGTH_UNITS[length_unit]
     if "position" in arrays and arrays["position"].ndim in (2, 3):
         place = arrays["position"]
-        length, said = in_metres(arrays["times"], place.reshape(len(place), -1, place.shape[-1]), length)
+        length, said = logs.in_metres(arrays["times"], place.reshape(len(place), -1, place.shape[-1]), length)
         notes += said
         arrays["position"] = place * length
     for key, unit in (("velocity", length), ("omega", 1.0)):
@@ -193,7 +185,7 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
     Raises:
         ValueError: If the suffix is another, `path` is a directory or its parent does not exist.
     """
-    checked_kind("motion", motion, Motion)
+    checks.checked_kind("motion", motion, Motion)
     target = checked_output(path)
     if target.suffix.lower() == ".npz":
         arrays = {key: getattr(motion, key) for key in ("times", *QUANTITIES)}
@@ -209,8 +201,8 @@ def save_motion(path: str | os.PathLike[str], motion: Motion) -> None:
         raise ValueError(f"motion must be written to an .npz or .csv file, got {target}")
     prefixes = [""] if len(motion.names) == 1 else [f"{name}." for name in motion.names]
     # Where a reader would take them for others, units stand in the names.
-    seconds = " [s]" if mended_times(motion.times, None)[2] else ""
-    metres = " [m]" if in_metres(motion.times, motion.position, None)[1] else ""
+    seconds = " [s]" if logs.mended_times(motion.times, None)[2] else ""
+    metres = " [m]" if logs.in_metres(motion.times, motion.position, None)[1] else ""
     units = {"position": metres, "velocity": metres and " [m/s]"}
     header = [f"time{seconds}"]
     header += [p + c + units.get(key, "") for p in prefixes for key in _COLUMNS for c in _COLUMNS[key]]
@@ -258,9 +250,9 @@ def _read_npz(source: Path) -> _Read:
 
 
 def _read_table(source: Path) -> _Read:
-    table = read_table(source)
+    table = logs.read_table(source)
     try:
-        columns = understood(table.header)
+        columns = logs.understood(table.header)
     except ValueError as error:
         raise ValueError(f"{source} {error}") from error
     if not columns.groups:

@@ -1,8 +1,8 @@
 """What a robot holds, from what its wrist feels: mass, centre and inertia from forces and torques."""
 
 from dano.identification.wrench._estimate import Load as Load
-from dano.identification.wrench._fit import identify_load as identify_load
-from dano.identification.wrench._joints import (
+from dano.identification.wrench._fit import (
+    identify_load as identify_load,
     identify_load_on_arm as identify_load_on_arm,
     JointLog as JointLog,
 )

@@ -134,7 +134,7 @@ class Twists(NamedTuple):
     alpha: np.ndarray  # Its rate [rad/s², S]
 
 
-class Surroundings(NamedTuple):
+class LogContext(NamedTuple):
     """Rows around each row, and what makes polynomials in time of values there."""
 
     middle: np.ndarray  # Rows, shape (n,)
@@ -143,7 +143,7 @@ class Surroundings(NamedTuple):
     scale: float  # [s]
 
 
-def surroundings(times: np.ndarray, known: np.ndarray) -> Surroundings:
+def surroundings(times: np.ndarray, known: np.ndarray) -> LogContext:
     """Where polynomials can be put through rows around a row.
 
     Args:
@@ -167,7 +167,7 @@ def surroundings(times: np.ndarray, known: np.ndarray) -> Surroundings:
             f" it, got {len(middle)}"
         )
     tau = (times[near] - times[middle][:, None]) / (half * step)
-    return Surroundings(middle, near, np.linalg.pinv(tau[..., None] ** np.arange(_DEGREE + 1)), half * step)
+    return LogContext(middle, near, np.linalg.pinv(tau[..., None] ** np.arange(_DEGREE + 1)), half * step)
 
 
 def twists(log: WristLog) -> Twists:

@@ -11,10 +11,8 @@ from jaxtyping import Float, UInt8
 from dano.checks import checked_kind, checked_text
 from dano.exchange import level_triangles
 from dano.maths import quat_from_matrix
-from dano.report._capture import SPLIT_COLOURS
-from dano.report.viewing._ground import add_ground, add_note
-from dano.report.viewing._opening import open_on
-from dano.report.viewing._serving import serve, Viewer, write_file
+from dano.report._training import SPLIT_COLOURS
+from dano.report.viewing._serving import add_ground, open_on, serve, Viewer, write_shown
 from dano.vision import Capture, checked_colour, View, visual_hull
 
 _THUMBNAIL = 96
@@ -85,12 +83,7 @@ def write_capture_view(capture: Capture, path: str | os.PathLike[str], *, unit: 
     """
     _check(capture, unit)
 
-    def fill(server: Any) -> str:
-        shown = _ShownCapture(server, capture, unit)
-        add_note(server, [shown.said, shown.ground.said], shown.ground)
-        return shown.opening.in_page(server.get_scene_serializer().as_html())
-
-    write_file(path, fill)
+    write_shown(path, lambda server: _ShownCapture(server, capture, unit))
 
 
 def _check(capture: Capture, unit: str) -> None:

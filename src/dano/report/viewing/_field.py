@@ -13,11 +13,9 @@ from dano.checks import checked_kind, checked_number
 from dano.exchange import enclosed, level_triangles, signed_distances, Triangles
 from dano.fields import AbstractField, AbstractShape, bake, GridField, SignedDistanceGrid
 from dano.objects import node_values
-from dano.report._overlay import round_below
-from dano.report.viewing._ground import add_ground, add_note
-from dano.report.viewing._meshes import add_coloured, BodyMesh, shape_mesh, vertex_colours
-from dano.report.viewing._opening import open_on
-from dano.report.viewing._serving import serve, Viewer, write_file
+from dano.report._stage import round_below
+from dano.report.viewing._drawn import add_coloured, BodyMesh, shape_mesh, vertex_colours
+from dano.report.viewing._serving import add_ground, open_on, serve, Viewer, write_shown
 from dano.vision import checked_colour, LearnedField, PALETTE, usual_level
 
 _NODES = 96
@@ -83,12 +81,7 @@ def write_field_view(
     """
     _check(field, level)
 
-    def fill(server: Any) -> str:
-        shown = _ShownField(server, field, level)
-        add_note(server, [shown.said, shown.ground.said], shown.ground)
-        return shown.opening.in_page(server.get_scene_serializer().as_html())
-
-    write_file(path, fill)
+    write_shown(path, lambda server: _ShownField(server, field, level))
 
 
 def _check(field: AbstractField, level: float | None) -> None:
@@ -102,7 +95,7 @@ def _check(field: AbstractField, level: float | None) -> None:
             raise ValueError(f"level applies to densities, got {level} for a {type(field).__name__}")
 
 
-class Surface:
+class FieldSurface:
     """The surface of a field at any level (host)."""
 
     level: float | None  # Density of the surface when the page opens; None for a solid
@@ -159,7 +152,7 @@ def _sampled(
     return grid, values, usual_level(values), float(values.max())
 
 
-class _Samples(NamedTuple):
+class _FieldSamples(NamedTuple):
     values: Float[np.ndarray, "nx ny nz"]
     origin: Float[np.ndarray, "3"]
     spacing: Float[np.ndarray, "3"]
@@ -167,7 +160,7 @@ class _Samples(NamedTuple):
 
 def _cropped(
     values: Float[np.ndarray, "nx ny nz"], grid: GridField | SignedDistanceGrid, least: float
-) -> _Samples:
+) -> _FieldSamples:
     """The part that reaches a value, no finer than is drawn, and with less around it."""
     inside = np.argwhere(values >= least)
     low, high = np.maximum(inside.min(axis=0) - 1, 0), inside.max(axis=0) + 2
@@ -182,7 +175,7 @@ def _cropped(
         spacing = spacing * step
     # Beyond its bounds a field is zero: a surface that reaches them is closed there.
     empty = min(0.0, 2 * least, float(part.min()))
-    return _Samples(np.pad(part, 1, constant_values=empty), origin - spacing, spacing)
+    return _FieldSamples(np.pad(part, 1, constant_values=empty), origin - spacing, spacing)
 
 
 class _ShownField:
@@ -197,7 +190,7 @@ class _ShownField:
 
     def __init__(self, server: Any, field: AbstractField, level: float | None):
         self._server = server
-        self.surface = Surface(field, level)
+        self.surface = FieldSurface(field, level)
         self._busy = threading.Lock()
         self._text: Any = None
         server.scene.set_up_direction("+z")

@@ -11,9 +11,8 @@ from jaxtyping import Float
 from dano.checks import checked_kind
 from dano.fields import Splats
 from dano.maths import quat_to_matrix
-from dano.report._overlay import round_below
-from dano.report.viewing._opening import open_on
-from dano.report.viewing._serving import serve, Viewer
+from dano.report._stage import round_below
+from dano.report.viewing._serving import open_on, serve, Viewer
 
 # A ray has met a surface where so much of its light is left.
 _HALF = 0.5

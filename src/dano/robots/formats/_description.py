@@ -20,112 +20,68 @@ class Placed:
 
 @dataclass(frozen=True)
 class Solid:
-    """A geometry of a link.
+    """A geometry of a link."""
 
-    Attributes:
-        kind: "box" (half extents), "sphere" (radius), "cylinder" and "capsule" (radius, half length),
-            "ellipsoid" (half axes), "plane" (none: all below its x and y axes), "mesh" (scales along its
-            axes).
-        numbers: Its measures [m], or scales [1].
-        place: In the frame of the link.
-        path: Of a mesh that is a file.
-        triangles: Vertices [m] and faces of a mesh that a reader has read already.
-    """
-
+    # "box" (half extents), "sphere" (radius), "cylinder" and "capsule" (radius, half length), "ellipsoid"
+    # (half axes), "plane" (none: all below its x and y axes), "mesh" (scales along its axes).
     kind: str
-    numbers: tuple[float, ...]
-    place: Placed = Placed()
-    path: Path | None = None
+    numbers: tuple[float, ...]  # Its measures [m], or scales [1]
+    place: Placed = Placed()  # In the frame of the link
+    path: Path | None = None  # Of a mesh that is a file
+    # Vertices [m] and faces of a mesh that a reader has read already.
     triangles: tuple[np.ndarray, np.ndarray] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
 class Link:
-    """A link of a robot.
+    """A link of a robot."""
 
-    Attributes:
-        name: Unique among links.
-        mass: [kg]; 0 for a link that is only a frame.
-        com: Centre of mass [m, frame of the link].
-        inertia: About it [kg m², axes of the link], shape (3, 3).
-        solids: What it touches with.
-        visuals: What it looks like.
-        gravcomp: Share of its weight that is held [1].
-    """
-
-    name: str
-    mass: float = 0.0
-    com: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    name: str  # Unique among links
+    mass: float = 0.0  # [kg]; 0 for a link that is only a frame
+    com: np.ndarray = field(default_factory=lambda: np.zeros(3))  # Centre of mass [m, frame of the link]
+    # About it [kg m², axes of the link], shape (3, 3).
     inertia: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
-    solids: tuple[Solid, ...] = ()
-    visuals: tuple[Solid, ...] = ()
-    gravcomp: float = 0.0
+    solids: tuple[Solid, ...] = ()  # What it touches with
+    visuals: tuple[Solid, ...] = ()  # What it looks like
+    gravcomp: float = 0.0  # Share of its weight that is held [1]
 
 
 @dataclass(frozen=True)
 class Drive:
-    """An actuator of a joint, with the numbers of a `dano.Motor`.
+    """An actuator of a joint, with the numbers of a `dano.Motor`."""
 
-    Attributes:
-        name: Unique among drives.
-        kind: "effort", "position" or "velocity".
-        stiffness: Of "position" [N m/rad or N/m].
-        damping: Of "position" and "velocity" [N m s/rad or N s/m].
-        gear: How far it turns when the joint moves by one [1].
-        limits: Least and largest effort [N m or N].
-        commands: Least and largest command.
-    """
-
-    name: str
-    kind: str
-    stiffness: float = 0.0
-    damping: float = 0.0
-    gear: float = 1.0
-    limits: tuple[float, float] = (-np.inf, np.inf)
-    commands: tuple[float, float] = (-np.inf, np.inf)
+    name: str  # Unique among drives
+    kind: str  # "effort", "position" or "velocity"
+    stiffness: float = 0.0  # Of "position" [N m/rad or N/m]
+    damping: float = 0.0  # Of "position" and "velocity" [N m s/rad or N s/m]
+    gear: float = 1.0  # How far it turns when the joint moves by one [1]
+    limits: tuple[float, float] = (-np.inf, np.inf)  # Least and largest effort [N m or N]
+    commands: tuple[float, float] = (-np.inf, np.inf)  # Least and largest command
 
 
 @dataclass(frozen=True)
 class Connection:
-    """A joint of a robot.
+    """A joint of a robot."""
 
-    Attributes:
-        name: Unique among joints.
-        kind: "hinge", "slide", "weld", "ball", "planar" or "floating".
-        parent: Link that carries it.
-        child: Link that hangs on it.
-        place: Of the child's frame at q = 0, in the parent's.
-        axis: In the child's frame.
-        anchor: A point of the axis [m, child's frame].
-        limits: Least and largest q [rad or m]; None without.
-        efforts: Least and largest torque or force [N m or N]; infinite without.
-        damping: [N m s/rad or N s/m].
-        friction: [N m or N].
-        armature: [kg m² or kg].
-        stiffness: Of a spring [N m/rad or N/m].
-        rest: Where it exerts no force.
-        home: q in the pose that the file shows [rad or m].
-        mimics: Name of the joint that it follows, ratio, shift; None if it does not.
-        drive: Its actuator.
-    """
-
-    name: str
-    kind: str
-    parent: str
-    child: str
-    place: Placed = Placed()
-    axis: tuple[float, ...] = (0.0, 0.0, 1.0)
-    anchor: tuple[float, ...] = (0.0, 0.0, 0.0)
-    limits: tuple[float, float] | None = None
+    name: str  # Unique among joints
+    kind: str  # "hinge", "slide", "weld", "ball", "planar" or "floating"
+    parent: str  # Link that carries it
+    child: str  # Link that hangs on it
+    place: Placed = Placed()  # Of the child's frame at q = 0, in the parent's
+    axis: tuple[float, ...] = (0.0, 0.0, 1.0)  # In the child's frame
+    anchor: tuple[float, ...] = (0.0, 0.0, 0.0)  # A point of the axis [m, child's frame]
+    limits: tuple[float, float] | None = None  # Least and largest q [rad or m]; None without
+    # Least and largest torque or force [N m or N]; infinite without.
     efforts: tuple[float, float] = (-np.inf, np.inf)
-    damping: float = 0.0
-    friction: float = 0.0
-    armature: float = 0.0
-    stiffness: float = 0.0
-    rest: float = 0.0
-    home: float = 0.0
+    damping: float = 0.0  # [N m s/rad or N s/m]
+    friction: float = 0.0  # [N m or N]
+    armature: float = 0.0  # [kg m² or kg]
+    stiffness: float = 0.0  # Of a spring [N m/rad or N/m]
+    rest: float = 0.0  # Where it exerts no force
+    home: float = 0.0  # q in the pose that the file shows [rad or m]
+    # Name of the joint that it follows, ratio, shift; None if it does not.
     mimics: tuple[str, float, float] | None = None
-    drive: Drive | None = None
+    drive: Drive | None = None  # Its actuator
 
     @property
     def effort(self) -> float:
@@ -135,98 +91,62 @@ class Connection:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A state that a file names.
+    """A state that a file names."""
 
-    Attributes:
-        q: Coordinates of joints by name [rad or m]; of a ball its rotation vector.
-        v: Their velocities.
-        places: Of links that move freely, by name: position [m, W] and orientation wxyz of the link's frame.
-        speeds: Theirs: velocity of the frame's origin [m/s, W] and omega [rad/s, link].
-    """
-
-    q: dict[str, np.ndarray]
-    v: dict[str, np.ndarray]
+    q: dict[str, np.ndarray]  # Coordinates of joints by name [rad or m]; of a ball its rotation vector
+    v: dict[str, np.ndarray]  # Their velocities
+    # Of links that move freely, by name: position [m, W] and orientation wxyz of the link's frame.
     places: dict[str, tuple[np.ndarray, np.ndarray]]
+    # Theirs: velocity of the frame's origin [m/s, W] and omega [rad/s, link].
     speeds: dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class Tie:
-    """What closes a loop of a robot: see `dano.Loop`, with links for bodies.
+    """What closes a loop of a robot: see `dano.Loop`, with links for bodies."""
 
-    Attributes:
-        kind: "point" or "weld".
-        first: A link.
-        second: Another.
-        position: A point of the first [m, frame of the link].
-        anchor: The point of the second that stays there.
-        orientation: Of a weld: of the second link's frame in the first's, wxyz.
-    """
-
-    kind: str
-    first: str
-    second: str
-    position: tuple[float, ...]
-    anchor: tuple[float, ...]
+    kind: str  # "point" or "weld"
+    first: str  # A link
+    second: str  # Another
+    position: tuple[float, ...]  # A point of the first [m, frame of the link]
+    anchor: tuple[float, ...]  # The point of the second that stays there
+    # Of a weld: of the second link's frame in the first's, wxyz.
     orientation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Lacking:
-    """Something in a file that dano has no counterpart of.
+    """Something in a file that dano has no counterpart of."""
 
-    Attributes:
-        feature: By which it may be left out.
-        text: What the file says.
-    """
-
-    feature: str
-    text: str
+    feature: str  # By which it may be left out
+    text: str  # What the file says
 
 
-class Meeting(NamedTuple):
-    """Two links that touch each other.
+class GeomPair(NamedTuple):
+    """Two links that touch each other."""
 
-    Attributes:
-        frictions: Sliding frictions of their shapes, different ones.
-        named: Whether the file names the pair.
-    """
-
-    frictions: tuple[float, ...]
-    named: bool
+    frictions: tuple[float, ...]  # Sliding frictions of their shapes, different ones
+    named: bool  # Whether the file names the pair
 
 
 @dataclass(frozen=True)
 class Description:
-    """A robot's file.
+    """A robot's file."""
 
-    Attributes:
-        name: Of the robot.
-        source: The file.
-        links: All links.
-        joints: All joints.
-        ties: What closes loops.
-        world: Name of the root link if it stands for the world; what is welded to it are things of their own.
-        gravity: [m/s²]; None if the format has none.
-        lacking: What must be left out by name.
-        notes: What was read in another way than it is written, one line each.
-        keyframes: States that the file names.
-        meets: Which links touch each other; None where the format does not say.
-        silent: What is not read and changes how it is simulated, one line each.
-    """
-
-    name: str
-    source: Path
-    links: tuple[Link, ...]
-    joints: tuple[Connection, ...]
-    ties: tuple[Tie, ...] = ()
+    name: str  # Of the robot
+    source: Path  # The file
+    links: tuple[Link, ...]  # All links
+    joints: tuple[Connection, ...]  # All joints
+    ties: tuple[Tie, ...] = ()  # What closes loops
+    # Name of the root link if it stands for the world; what is welded to it are things of their own.
     world: str | None = None
-    gravity: tuple[float, float, float] | None = None
-    lacking: tuple[Lacking, ...] = ()
-    notes: tuple[str, ...] = ()
-    keyframes: dict[str, Keyframe] = field(default_factory=dict)
-    meets: dict[frozenset[str], Meeting] | None = None
-    silent: tuple[str, ...] = ()
+    gravity: tuple[float, float, float] | None = None  # [m/s²]; None if the format has none
+    lacking: tuple[Lacking, ...] = ()  # What must be left out by name
+    notes: tuple[str, ...] = ()  # What was read in another way than it is written, one line each
+    keyframes: dict[str, Keyframe] = field(default_factory=dict)  # States that the file names
+    # Which links touch each other; None where the format does not say.
+    meets: dict[frozenset[str], GeomPair] | None = None
+    silent: tuple[str, ...] = ()  # What is not read and changes how it is simulated, one line each
 
     def link(self, name: str) -> Link:
         """A link by name."""

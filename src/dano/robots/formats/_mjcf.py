@@ -1,20 +1,32 @@
-"""The robot files of MuJoCo, read by its compiler: defaults, includes and angles are its business."""
+"""The robot files of MuJoCo, read by its compiler: defaults, includes and angles are its business.
+
+States that files of MuJoCo name.
+Which shapes of MuJoCo's files touch which, and with what friction: its own rules.
+
+Two geoms touch where their masks say so, unless they are parts of one body or of neighbours, or their bodies
+are excluded; or where a pair names them (MuJoCo's documentation, "Collision detection", "Selection").
+Actuators of MuJoCo's files as drives of joints, where a motor of dano does the same.
+"""
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from dano.extras import optional
-from dano.maths import quat_conjugate, quat_multiply
-from dano.robots.formats._actuators import drives_of, OTHER, Pull
+from dano.maths import quat_conjugate, quat_log, quat_multiply
 from dano.robots.formats._description import (
     Connection,
     Description,
     displaced,
+    Drive,
+    GeomPair,
     held_at,
+    Keyframe,
     Lacking,
     Link,
     Placed,
@@ -22,10 +34,234 @@ from dano.robots.formats._description import (
     Tie,
     without_followers,
 )
-from dano.robots.formats._keyframes import keyframes_of
 from dano.robots.formats._lacking import EQUALITIES, lacking_of, notes_of, silent_of
-from dano.robots.formats._tendons import length_of, Tendons, with_loads_of_followers, within
-from dano.robots.formats._touching import meets_of, touching_geoms
+from dano.robots.formats._tendons import length_of, shares_of, Tendons, with_loads_of_followers, within
+
+
+def keyframes_of(
+    model: Any, mujoco: Any, joints: Sequence[str], bodies: Sequence[str]
+) -> dict[str, Keyframe]:
+    """All key frames by name; those without one are "key 0" and so on.
+
+    Args:
+        model: Of MuJoCo.
+        mujoco: The package.
+        joints: Names of the joints.
+        bodies: Names of the bodies after the world.
+    """
+    types, found = mujoco.mjtJoint, {}
+    for k in range(model.nkey):
+        frame = Keyframe({}, {}, {}, {})
+        for j, name in enumerate(joints):
+            kind, place, row = (int(x[j]) for x in (model.jnt_type, model.jnt_qposadr, model.jnt_dofadr))
+            q, v = model.key_qpos[k, place:].copy(), model.key_qvel[k, row:].copy()
+            if kind == int(types.mjJNT_FREE):
+                body = bodies[int(model.jnt_bodyid[j]) - 1]
+                frame.places[body] = q[:3], q[3:7] / np.linalg.norm(q[3:7])
+                frame.speeds[body] = v[:3], v[3:6]
+            elif kind == int(types.mjJNT_BALL):
+                frame.q[name] = np.asarray(quat_log(q[:4] / np.linalg.norm(q[:4])))
+                frame.v[name] = v[:3]
+            else:
+                frame.q[name], frame.v[name] = q[0], v[0]
+        found[model.key(k).name or f"key {k}"] = frame
+    return found
+
+
+def meets_of(
+    model: Any, mujoco: Any, links: Sequence[str]
+) -> tuple[dict[frozenset[str], GeomPair], list[str]]:
+    """Who touches whom, and what of that is read otherwise than MuJoCo does, one line each.
+
+    Args:
+        model: MuJoCo's model.
+        mujoco: The library.
+        links: The link of each geom.
+    """
+    disabled = int(model.opt.disableflags)
+    bits = mujoco.mjtDisableBit
+    if disabled & (int(bits.mjDSBL_CONTACT) | int(bits.mjDSBL_CONSTRAINT)):
+        return {}, []
+    may = _may_touch(model, filters_parents=not disabled & int(bits.mjDSBL_FILTERPARENT))
+    friction = _mixed_friction(model)
+    named = np.zeros_like(may)
+    for k in range(model.npair):
+        i, j = int(model.pair_geom1[k]), int(model.pair_geom2[k])
+        slides = float(model.pair_friction[k][0]) if model.pair_dim[k] > 1 else 0.0
+        for pair in ((i, j), (j, i)):
+            may[pair] = named[pair] = True
+            friction[pair] = slides
+    if int(model.opt.enableflags) & int(mujoco.mjtEnableBit.mjENBL_OVERRIDE):
+        friction = np.where(friction > 0, float(model.opt.o_friction[0]), 0.0)
+    found: dict[frozenset[str], GeomPair] = {}
+    rows = {name: np.flatnonzero(np.array(links) == name) for name in dict.fromkeys(links)}
+    touching = np.asarray(may.any(axis=1))
+    parted = []
+    names = [name for name, geoms in rows.items() if touching[geoms].any()]
+    for k, first in enumerate(names):
+        for second in names[k + 1 :]:
+            block = np.ix_(rows[first], rows[second])
+            if not may[block].any():
+                continue
+            slides = tuple(np.unique(friction[block][may[block]]).tolist())
+            found[frozenset((first, second))] = GeomPair(slides, bool(named[block].any()))
+            both = np.ix_(rows[first][touching[rows[first]]], rows[second][touching[rows[second]]])
+            if not may[both].all():
+                parted.append(f"{first} and {second}")
+    said = []
+    if parted:
+        shown = ", ".join(parted[:3]) + (f" and {len(parted) - 3} more" if len(parted) > 3 else "")
+        said.append(f"that only some shapes of {shown} touch each other: in dano all of a link do")
+    return found, said
+
+
+def touching_geoms(model: Any) -> Bool[np.ndarray, " g"]:
+    """Whether each geom can touch anything: by its masks, or because a pair names it."""
+    touches = (np.asarray(model.geom_contype) != 0) | (np.asarray(model.geom_conaffinity) != 0)
+    touches[np.asarray(model.pair_geom1, int)] = True
+    touches[np.asarray(model.pair_geom2, int)] = True
+    return touches
+
+
+def _may_touch(model: Any, *, filters_parents: bool) -> Bool[np.ndarray, "g g"]:
+    """By masks, bodies and exclusions."""
+    kinds, others = np.asarray(model.geom_contype), np.asarray(model.geom_conaffinity)
+    may = (kinds[:, None] & others[None, :]) | (kinds[None, :] & others[:, None])
+    body = np.asarray(model.geom_bodyid)
+    welded = np.asarray(model.body_weldid)
+    own = welded[body]
+    above = welded[np.asarray(model.body_parentid)[own]]
+    may = (may != 0) & (own[:, None] != own[None, :])
+    if filters_parents:
+        moves = (own[:, None] != 0) & (own[None, :] != 0)
+        near = (own[:, None] == above[None, :]) | (own[None, :] == above[:, None])
+        may &= ~(moves & near)
+    for signature in np.asarray(model.exclude_signature, int):
+        first, second = signature >> 16, signature & 0xFFFF
+        one, other = body == first, body == second
+        may &= ~((one[:, None] & other[None, :]) | (other[:, None] & one[None, :]))
+    return may
+
+
+def _mixed_friction(model: Any) -> Float[np.ndarray, "g g"]:
+    """Sliding friction of two geoms: that of the higher priority, of equal ones the larger."""
+    sliding, priority = np.asarray(model.geom_friction, float)[:, 0], np.asarray(model.geom_priority)
+    dims = np.asarray(model.geom_condim)
+    above, below = priority[:, None] > priority[None, :], priority[:, None] < priority[None, :]
+
+    def mixed(values: np.ndarray) -> np.ndarray:
+        first, second = values[:, None] + 0 * values[None, :], values[None, :] + 0 * values[:, None]
+        return np.where(above, first, np.where(below, second, np.maximum(first, second)))
+
+    return np.where(mixed(dims) > 1, mixed(sliding), 0.0)
+
+
+ALL, OTHER = "actuators", "other actuators"
+"""Names by which all of them are left out, or those that dano has no counterpart of."""
+
+
+class Pull(NamedTuple):
+    """A drive of several joints: its length is the sum of their coordinates by their shares."""
+
+    drive: Drive  # The drive
+    shares: dict[int, float]  # By the indices of the joints
+
+
+def drives_of(model: Any, mujoco: Any) -> tuple[dict[int, Drive], list[Pull], list[Lacking]]:
+    """The drives by the index of their joint, those of fixed tendons, and what no motor does.
+
+    MuJoCo's force is gain · u + bias, with constant, place and speed in the bias (its documentation,
+    "Force generation"); `dano.Motor` has those of a motor, and of servos that hold a place or a speed.
+    """
+    found: dict[int, Drive] = {}
+    pulls: list[Pull] = []
+    lacking: list[Lacking] = []
+    if _disabled(model, mujoco, "mjDSBL_ACTUATION"):
+        return found, pulls, lacking
+    for i in range(model.nactuator if hasattr(model, "nactuator") else model.nu):
+        name = model.actuator(i).name or f"actuator {i}"
+        if int(model.opt.disableactuator) >> int(model.actuator_group[i]) & 1:
+            continue
+        joint = int(model.actuator_trnid[i][0])
+        shares = _shares(model, mujoco, i)
+        why = _unlike(model, mujoco, i)
+        if why is None and shares is None and joint in found:
+            why = f"drives joint {model.joint(joint).name!r}, which {found[joint].name!r} drives already"
+        if why is not None:
+            lacking.append(Lacking(OTHER, f"actuator {name!r} {why}, which dano has no motor for"))
+            continue
+        drive = _drive(model, mujoco, i, name)
+        if isinstance(drive, str):
+            lacking.append(Lacking(OTHER, f"actuator {name!r} {drive}, which dano has no motor for"))
+        elif drive is not None and shares is not None:
+            pulls.append(Pull(drive, shares))
+        elif drive is not None:
+            found[joint] = drive
+    return found, pulls, lacking
+
+
+def _shares(model: Any, mujoco: Any, i: int) -> dict[int, float] | None:
+    """Shares of joints in the length of a fixed tendon that an actuator pulls; None for none."""
+    if int(model.actuator_trntype[i]) != int(mujoco.mjtTrn.mjTRN_TENDON):
+        return None
+    return shares_of(model, mujoco, int(model.actuator_trnid[i][0]))
+
+
+def _disabled(model: Any, mujoco: Any, flag: str) -> bool:
+    return bool(int(model.opt.disableflags) & int(getattr(mujoco.mjtDisableBit, flag)))
+
+
+def _unlike(model: Any, mujoco: Any, i: int) -> str | None:
+    """Why an actuator is not a motor of one joint; None if it is."""
+    joints = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
+    shares = _shares(model, mujoco, i)
+    if shares is None and int(model.actuator_trntype[i]) not in map(int, joints):
+        return "acts on no joint, but on a tendon of sites, a site or a body"
+    kinds = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+    moved = [int(model.actuator_trnid[i][0])] if shares is None else list(shares)
+    if any(int(model.jnt_type[j]) not in map(int, kinds) for j in moved):
+        return "acts on a ball or a free joint"
+    if int(model.actuator_dyntype[i]) != int(mujoco.mjtDyn.mjDYN_NONE):
+        return "has a state of its own (a filter, an integrator, a muscle)"
+    for name in ("actuator_armature", "actuator_damping", "actuator_delay"):
+        if np.any(getattr(model, name, np.zeros((i + 1, 1)))[i]):
+            return f"has {name.removeprefix('actuator_')}"
+    if int(getattr(model, "actuator_plugin", np.full(i + 1, -1))[i]) >= 0:
+        return "is a plugin"
+    plain = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    biases = mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE
+    if not plain or int(model.actuator_biastype[i]) not in map(int, biases):
+        return "has a gain or a bias that depends on more than place and speed"
+    return None
+
+
+def _drive(model: Any, mujoco: Any, i: int, name: str) -> Drive | str | None:
+    """The drive, None for one without effect, or what is special about it."""
+    gain, gear = float(model.actuator_gainprm[i][0]), float(model.actuator_gear[i][0])
+    affine = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    constant, place, speed = (float(x) for x in model.actuator_biasprm[i][:3]) if affine else (0.0,) * 3
+    forces = _range(model.actuator_forcerange[i], model.actuator_forcelimited[i])
+    clamped = not _disabled(model, mujoco, "mjDSBL_CLAMPCTRL")
+    commands = _range(model.actuator_ctrlrange[i], clamped and model.actuator_ctrllimited[i])
+    if gear == 0 or gain == constant == place == speed == 0:
+        return None
+    if constant == place == speed == 0:
+        # f = gain · u within limits: that of a motor whose gear has the gain, within theirs by the gain.
+        bounds = np.sort(np.array(forces) / gain)
+        least, most = max(bounds[0], commands[0]), min(bounds[1], commands[1])
+        if least > most:
+            return "has limits of force and command that exclude each other"
+        return Drive(name, "effort", gear=gear * gain, limits=(float(least), float(most)), commands=commands)
+    if constant == 0 and gain > 0 and place == -gain and speed <= 0:
+        return Drive(name, "position", gain, -speed, gear, forces, commands)
+    if constant == place == 0 and gain > 0 and speed == -gain:
+        return Drive(name, "velocity", 0.0, gain, gear, forces, commands)
+    return f"has the force {gain:g} u + {constant:g} + {place:g} l + {speed:g} dl/dt"
+
+
+def _range(values: np.ndarray, limited: Any) -> tuple[float, float]:
+    return (float(values[0]), float(values[1])) if limited else (-np.inf, np.inf)
+
 
 _WORLD = "world"
 _SHIFTED = 1e-9
@@ -58,10 +294,10 @@ def read_mjcf(path: Path, *, balance_inertia: bool = False) -> Description:
         hint = ": balance_inertia=True does that" if "balanceinertia" in str(error) else ""
         said = " ".join(str(error).split())
         raise ValueError(f"{path} must be a file that MuJoCo reads: {said}{hint}") from error
-    return _Reader(path, model, mujoco).description()
+    return _MjcfReader(path, model, mujoco).description()
 
 
-class _Reader:
+class _MjcfReader:
     """Reads rows of MuJoCo's model."""
 
     def __init__(self, path: Path, model: Any, mujoco: Any):

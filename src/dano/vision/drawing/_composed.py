@@ -96,7 +96,7 @@ class Part(eqx.Module):
         return jax.lax.cond(jnp.any(rays.far > rays.near), found, none)
 
 
-class Plane(NamedTuple):
+class DrawnPlane(NamedTuple):
     """An opaque matte half-space."""
 
     normal: Float[Array, "3"]  # Unit [W], shape (3,)
@@ -256,10 +256,10 @@ def part_of(item: Item, camera: AbstractCamera) -> Part:
     return Part(model, *(jnp.asarray(x, jnp.float32) for x in (rotation, position, sharpness)))
 
 
-def _plane_of(item: Item) -> Plane:
+def _plane_of(item: Item) -> DrawnPlane:
     plane = item.plane
     assert plane is not None
-    return Plane(*(jnp.asarray(x, jnp.float32) for x in (plane[:3], plane[3], item.colour**GAMMA)))
+    return DrawnPlane(*(jnp.asarray(x, jnp.float32) for x in (plane[:3], plane[3], item.colour**GAMMA)))
 
 
 def _may_meet(things: list[Item], floors: list, origin: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -468,7 +468,7 @@ def reached_through(
     return jax.lax.cond(jnp.any(rays.far > rays.near), found, lambda: jnp.ones_like(rays.far))
 
 
-def _to_plane(plane: Plane, origins: Array, directions: Array) -> Float[Array, " n"]:
+def _to_plane(plane: DrawnPlane, origins: Array, directions: Array) -> Float[Array, " n"]:
     """Distance to a plane seen from above; infinite otherwise."""
     height = product(origins, plane.normal) - plane.offset
     fall = -product(directions, plane.normal)

@@ -8,20 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
+from dano import fields, maths
 from dano.checks import checked_number, checked_optional
-from dano.fields import (
-    AbstractField,
-    AbstractShape,
-    bake,
-    GridField,
-    HalfSpace,
-    PosedShape,
-    redistanced,
-    SignedDistanceGrid,
-)
-from dano.maths import checked_array, Numbers, on_device, Pose, quat_to_matrix
 from dano.native import is_known
-from dano.vision.radiance import AbstractModel, LearnedField, SurfaceModel
+from dano.vision import radiance
 
 PALETTE = ("#e07a3f", "#3d7ea6", "#5f9e6e", "#c9a227", "#8d6cab", "#c8553d", "#4aa3a2", "#7a8450")
 """Colours for objects that state none, matte and different from each other in lightness too."""
@@ -51,11 +41,11 @@ class Item(eqx.Module):
         radius: Radius of that ball [m]; infinite for a half-space.
     """
 
-    shape: AbstractShape | None
-    medium: GridField | None
-    model: AbstractModel | None
+    shape: fields.AbstractShape | None
+    medium: fields.GridField | None
+    model: radiance.AbstractModel | None
     sharpness: float
-    pose: Pose
+    pose: maths.Pose
     colour: Float[np.ndarray, "3"]
     density_scale: float
     centre: Float[np.ndarray, "3"]
@@ -63,9 +53,9 @@ class Item(eqx.Module):
 
     def __init__(
         self,
-        field: AbstractField | AbstractModel,
-        pose: Pose | None = None,
-        colour: str | Numbers | None = None,
+        field: fields.AbstractField | radiance.AbstractModel,
+        pose: maths.Pose | None = None,
+        colour: str | maths.Numbers | None = None,
         *,
         level: int | float | None = None,
         density_scale: int | float | None = None,
@@ -89,9 +79,9 @@ class Item(eqx.Module):
             ValueError: If the field is unbounded and no half-space, it nowhere reaches `level`, both
                 `level` and `density_scale` are given, or a number is out of range.
         """
-        if not isinstance(field, AbstractField | AbstractModel):
+        if not isinstance(field, fields.AbstractField | radiance.AbstractModel):
             raise ValueError(f"field must be a dano field (an AbstractField), got {type(field).__name__}")
-        if isinstance(field, AbstractModel) and (level is not None or density_scale is not None):
+        if isinstance(field, radiance.AbstractModel) and (level is not None or density_scale is not None):
             raise ValueError("level and density_scale apply to fields, got one for a model")
         if level is not None and density_scale is not None:
             raise ValueError(
@@ -104,7 +94,7 @@ class Item(eqx.Module):
         ):
             if value is not None:
                 checked_number(name, value, above=0)
-        self.pose = checked_optional("pose", pose, Pose) or Pose()
+        self.pose = checked_optional("pose", pose, maths.Pose) or maths.Pose()
         self.density_scale = 0.0 if density_scale is None else float(density_scale)
         self.shape = self.medium = self.model = None
         self.sharpness = 0.0
@@ -112,7 +102,7 @@ class Item(eqx.Module):
         if model is not None and level is None and density_scale is None and colour is None:
             self.model = _single(model)
             self.sharpness = _drawn_sharpness(field) if sharpness is None else float(sharpness)
-        if isinstance(field, AbstractModel):
+        if isinstance(field, radiance.AbstractModel):
             if solid is None and colour is not None:
                 raise ValueError(
                     f"colour applies to solids and fields, got {colour!r} for a {type(field).__name__}"
@@ -123,7 +113,7 @@ class Item(eqx.Module):
             self.medium = drawn = _single(_grid(field))
         elif solid is not None and level is None:
             self.shape = drawn = _single(solid)
-        elif isinstance(field, AbstractShape):
+        elif isinstance(field, fields.AbstractShape):
             self.shape = drawn = _single(_without_moments(_traceable(field)))
         else:
             self.shape = drawn = _single(level_surface(_grid(field), level))
@@ -137,7 +127,7 @@ class Item(eqx.Module):
         if not bounded and self.plane is None:
             raise ValueError(f"field must have finite bounds or be a half-space, got {type(field).__name__}")
 
-    def at(self, pose: Pose) -> "Item":
+    def at(self, pose: maths.Pose) -> "Item":
         """The same item elsewhere."""
         return eqx.tree_at(lambda item: item.pose, self, pose)
 
@@ -145,9 +135,9 @@ class Item(eqx.Module):
     def plane(self) -> Float[np.ndarray, "4"] | None:
         """Unit normal and offset [m] of a half-space in the world; None for anything else."""
         shape, pose = self.shape, self.pose
-        while isinstance(shape, PosedShape):
+        while isinstance(shape, fields.PosedShape):
             shape, pose = shape.shape, pose.compose(_as(shape.pose, pose.position.dtype))
-        if not isinstance(shape, HalfSpace):
+        if not isinstance(shape, fields.HalfSpace):
             return None
         rotation, position = placement(pose)
         normal = rotation @ np.asarray(shape.normal_direction, dtype=np.float64)
@@ -160,13 +150,13 @@ class Item(eqx.Module):
         return rotation @ self.centre + position, self.radius
 
 
-def placement(pose: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+def placement(pose: maths.Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """Rotation matrix and translation of a pose on the host, where one picture needs them many times."""
-    rotation = quat_to_matrix(np.asarray(pose.orientation, dtype=np.float64))
+    rotation = maths.quat_to_matrix(np.asarray(pose.orientation, dtype=np.float64))
     return rotation, np.asarray(pose.position, dtype=np.float64)
 
 
-def checked_colour(colour: str | Numbers, name: str = "colour") -> Float[np.ndarray, "3"]:
+def checked_colour(colour: str | maths.Numbers, name: str = "colour") -> Float[np.ndarray, "3"]:
     """A colour as sRGB in [0, 1].
 
     Raises:
@@ -181,13 +171,13 @@ def checked_colour(colour: str | Numbers, name: str = "colour") -> Float[np.ndar
         if value is None or len(digits) != 6:
             raise ValueError(f"{name} must be '#rrggbb' or three numbers in [0, 1], got {colour!r}")
         return value
-    value = np.asarray(checked_array(name, colour, (3,)), dtype=np.float64)
+    value = np.asarray(maths.checked_array(name, colour, (3,)), dtype=np.float64)
     if value.min() < 0 or value.max() > 1:
         raise ValueError(f"{name} must have numbers in [0, 1], got {value.tolist()}")
     return value
 
 
-def level_surface(field: GridField, level: int | float | None = None) -> SignedDistanceGrid:
+def level_surface(field: fields.GridField, level: int | float | None = None) -> fields.SignedDistanceGrid:
     """The solid {φ ≥ level} of a grid as a signed distance, smooth enough to be shaded.
 
     The density φ/(φ + level), which is ½ on the surface and blind to how dense the inside is, is blurred
@@ -227,8 +217,8 @@ def level_surface(field: GridField, level: int | float | None = None) -> SignedD
     # A thin wall may not survive the blur; the surface then moves to where half of the peak is left.
     peak = float(share.max())
     middle = 0.5 if peak > 0.5 else 0.5 * peak
-    distance = redistanced(middle - share, spacing)
-    return SignedDistanceGrid(
+    distance = fields.redistanced(middle - share, spacing)
+    return fields.SignedDistanceGrid(
         distance.astype(np.float32), origin.astype(np.float32), spacing.astype(np.float32), edge=0.0
     )
 
@@ -238,31 +228,33 @@ def usual_level(values: Float[np.ndarray, "nx ny nz"]) -> float:
     return 0.5 * float(np.median(values[values > 0.05 * values.max()]))
 
 
-def _learned(field: AbstractField | AbstractModel) -> tuple[AbstractModel | None, AbstractShape | None]:
+def _learned(
+    field: fields.AbstractField | radiance.AbstractModel,
+) -> tuple[radiance.AbstractModel | None, fields.AbstractShape | None]:
     """The look of what was learned from photographs, and its solid if it has one."""
-    if isinstance(field, LearnedField):
+    if isinstance(field, radiance.LearnedField):
         return field.model, field.solid
-    if isinstance(field, SurfaceModel):
+    if isinstance(field, radiance.SurfaceModel):
         box = field.box
-        return field, SignedDistanceGrid(field.distances, box.origin, box.spacing)
-    return (field, None) if isinstance(field, AbstractModel) else (None, None)
+        return field, fields.SignedDistanceGrid(field.distances, box.origin, box.spacing)
+    return (field, None) if isinstance(field, radiance.AbstractModel) else (None, None)
 
 
-def _drawn_sharpness(field: AbstractField | AbstractModel) -> float:
-    if isinstance(field, LearnedField):
+def _drawn_sharpness(field: fields.AbstractField | radiance.AbstractModel) -> float:
+    if isinstance(field, radiance.LearnedField):
         return float(field.drawn_sharpness)
-    return 4 / float(field.spacing) if isinstance(field, SurfaceModel) else 0.0
+    return 4 / float(field.spacing) if isinstance(field, radiance.SurfaceModel) else 0.0
 
 
-def _grid(field: AbstractField) -> GridField:
-    if isinstance(field, GridField):
+def _grid(field: fields.AbstractField) -> fields.GridField:
+    if isinstance(field, fields.GridField):
         return field
     if not np.all(np.isfinite(np.asarray(field.bounds))):
         raise ValueError(f"field must have finite bounds to be drawn, got {type(field).__name__}")
-    return bake(field, _BAKE_NODES).grid
+    return fields.bake(field, _BAKE_NODES).grid
 
 
-def _traceable(shape: AbstractShape) -> AbstractShape:
+def _traceable(shape: fields.AbstractShape) -> fields.AbstractShape:
     """The shape, or its distances on a grid where kernels do not know it."""
     if is_known(shape) or not np.all(np.isfinite(np.asarray(shape.bounds))):
         return shape
@@ -272,11 +264,11 @@ def _traceable(shape: AbstractShape) -> AbstractShape:
     counts = np.ceil((upper - lower) / spacing).astype(int) + 3
     nodes = lower[:, None] + spacing * np.indices(counts).reshape(3, -1)
     distances = np.asarray(jax.jit(lambda x: shape.sdf_jet(x, 0))(nodes)).reshape(counts)
-    return SignedDistanceGrid(distances, lower, spacing, edge=0.0)
+    return fields.SignedDistanceGrid(distances, lower, spacing, edge=0.0)
 
 
-def _without_moments(shape: AbstractShape) -> AbstractShape:
-    if isinstance(shape, SignedDistanceGrid) and shape.moments is not None:
+def _without_moments(shape: fields.AbstractShape) -> fields.AbstractShape:
+    if isinstance(shape, fields.SignedDistanceGrid) and shape.moments is not None:
         return eqx.tree_at(lambda s: s.moments, shape, None)
     return shape
 
@@ -286,4 +278,4 @@ def _single(module: M) -> M:
 
 
 def _as(module: M, dtype: np.dtype) -> M:
-    return jax.tree.map(lambda x: on_device(np.asarray(x, dtype)), module)
+    return jax.tree.map(lambda x: maths.on_device(np.asarray(x, dtype)), module)

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
+from dano.compiling import one_program
 from dano.fields import AbstractShape, GridField
-from dano.hosted import hosted
 from dano.maths import product
 from dano.native import (
     cpu_kernel,
@@ -42,7 +42,7 @@ _BLOCK = 16
 _FEW, _SHARES = 512, 4
 
 
-class Thing(NamedTuple):
+class TracedItem(NamedTuple):
     """A solid somewhere (host only)."""
 
     shape: AbstractShape  # Its signed distance, bounded
@@ -67,7 +67,7 @@ class Tracer:
     """Finds what rays from one point meet."""
 
     def __init__(
-        self, things: Sequence[Thing], planes: Sequence[np.ndarray], origin: np.ndarray, **numbers: Any
+        self, things: Sequence[TracedItem], planes: Sequence[np.ndarray], origin: np.ndarray, **numbers: Any
     ):
         """Make a view of things.
 
@@ -248,7 +248,7 @@ def _made(shapes: Sequence[AbstractShape]) -> _Tables:
     return _Tables(parts, {name: np.ascontiguousarray(x) for name, x in named.items()})
 
 
-@hosted
+@one_program
 def _leaf_tables(leaves: list[Placed]) -> Leaves:
     return leaf_tables(leaves, jnp.float32)
 

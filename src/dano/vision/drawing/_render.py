@@ -27,7 +27,7 @@ from dano.vision.drawing._rays import (
     compile_kernels,
     Met,
     Painter,
-    Thing,
+    TracedItem,
     Tracer,
     transmitted,
 )
@@ -46,7 +46,7 @@ _AT_ONCE = 1 << 17
 _WITHIN = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
 
 
-class _View:
+class _RenderView:
     """One picture in the making: what is in it, and where the light comes from (host only)."""
 
     def __init__(
@@ -96,11 +96,11 @@ class _View:
             **surroundings._asdict(),
         )
 
-    def _thing(self, i: int, item: Item) -> Thing:
+    def _thing(self, i: int, item: Item) -> TracedItem:
         assert item.shape is not None
         rotation, position = placement(item.pose)
         # A learned look holds its own shadows.
-        return Thing(item.shape, rotation, position, *item.placed_ball, i in self.learned)
+        return TracedItem(item.shape, rotation, position, *item.placed_ball, i in self.learned)
 
 
 def _frame(item: Item) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
@@ -138,7 +138,7 @@ def render(
     items = checked_items("items", items, Item)
     checked_kind("camera", camera, AbstractCamera)
     surroundings = _surroundings(camera, _focus(camera, items), light, background)
-    view = _View(items, camera, surroundings, floor, shadows)
+    view = _RenderView(items, camera, surroundings, floor, shadows)
     rays = _rays_of(camera)
     order = rays.order
     drawn, touched = _drawn(view, rays.directions.T, rays.regular)
@@ -258,7 +258,7 @@ def prepare(items: Sequence[Item], camera: AbstractCamera) -> None:
 
 
 def _drawn(
-    view: _View, d: np.ndarray, regular: int = 0, together: int = 1
+    view: _RenderView, d: np.ndarray, regular: int = 0, together: int = 1
 ) -> tuple[UInt8[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Picture of rays, and which of them see more than empty surroundings; the rest as `Tracer` takes it."""
     met = view.tracer(d, regular, together)
@@ -279,7 +279,7 @@ def _drawn(
     return picture, touched
 
 
-def _show_learned(view: _View, d: np.ndarray, met: Met, colour: np.ndarray) -> Int[np.ndarray, " m"]:
+def _show_learned(view: _RenderView, d: np.ndarray, met: Met, colour: np.ndarray) -> Int[np.ndarray, " m"]:
     """Give learned solids their looks, in place; the indices of their rays."""
     found = [np.zeros(0, int)]
     for i, part in view.learned.items():
@@ -294,7 +294,7 @@ def _show_learned(view: _View, d: np.ndarray, met: Met, colour: np.ndarray) -> I
     return np.concatenate(found)
 
 
-def _darken_by_clouds(view: _View, d: np.ndarray, met: Met) -> None:
+def _darken_by_clouds(view: _RenderView, d: np.ndarray, met: Met) -> None:
     """Take what learned media let through from the lamp's light, in place."""
     light = view.surroundings.light
     points = view.origin[:, None] + np.where(met.which >= 0, met.depth, 0) * d

@@ -1,6 +1,5 @@
 """What a photograph is explained by: radiance models, volume rendering, the field that is learned."""
 
-from dano.vision.radiance._appearance import Appearance as Appearance, Network as Network, Share as Share
 from dano.vision.radiance._files import model_of_file as model_of_file
 from dano.vision.radiance._hash_model import HashModel as HashModel
 from dano.vision.radiance._learned import Doubt as Doubt, LearnedField as LearnedField
@@ -8,12 +7,15 @@ from dano.vision.radiance._models import (
     AbstractMedium as AbstractMedium,
     AbstractModel as AbstractModel,
     AbstractSurface as AbstractSurface,
+    Appearance as Appearance,
     DensityModel as DensityModel,
     DRAWING as DRAWING,
+    Network as Network,
     Sampling as Sampling,
     sections as sections,
     see as see,
     Seen as Seen,
+    Share as Share,
     SurfaceModel as SurfaceModel,
 )
 from dano.vision.radiance._osf import OSF as OSF

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.archive import read_archive, write_archive
 from dano.fields import HashGrid
 from dano.maths import Numbers
-from dano.vision.radiance._appearance import Network, Share
-from dano.vision.radiance._models import AbstractMedium
+from dano.vision.radiance._models import AbstractMedium, Network, Share
 
 FORMAT, VERSION = "dano-hash-model", 1
 _WIDTH, _CODE = 64, 16  # as Müller et al.

@@ -14,8 +14,7 @@ from dano.archive import LOOK, OBJECT, read_archive, write_archive
 from dano.fields import AbstractField, check_order, Jet, redistanced, SignedDistanceGrid, vmapped_jet
 from dano.maths import Numbers, on_device
 from dano.vision.capture import AbstractCamera
-from dano.vision.radiance._appearance import Appearance, Network
-from dano.vision.radiance._models import SurfaceModel
+from dano.vision.radiance._models import Appearance, Network, SurfaceModel
 from dano.vision.radiance._picture import Picture, picture
 
 FORMAT, VERSION = "dano-learned-field", 1

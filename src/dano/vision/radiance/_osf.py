@@ -18,8 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import read_archive, write_archive
 from dano.maths import Numbers
-from dano.vision.radiance._appearance import Share
-from dano.vision.radiance._models import AbstractMedium
+from dano.vision.radiance._models import AbstractMedium, Share
 
 FORMAT, VERSION = "dano-osf", 1
 # The architecture of michguo/osf, as above.

@@ -5,8 +5,8 @@ from dano.vision.structure._estimate import (
     estimate_poses as estimate_poses,
     EstimatedPoses as EstimatedPoses,
     PosedPicture as PosedPicture,
+    save_transforms as save_transforms,
 )
-from dano.vision.structure._file import save_transforms as save_transforms
 from dano.vision.structure._gauge import Scale as Scale, Up as Up
 from dano.vision.structure._markers import (
     detect_markers as detect_markers,
@@ -19,17 +19,15 @@ from dano.vision.structure._options import (
     PoseOptions as PoseOptions,
 )
 from dano.vision.structure._photographs import (
+    blur as blur,
+    is_video as is_video,
     mask_folder as mask_folder,
     Photograph as Photograph,
     picture_files as picture_files,
     read_photograph as read_photograph,
-    VIDEOS as VIDEOS,
-)
-from dano.vision.structure._sharpness import blur as blur
-from dano.vision.structure._similarity import pose_errors as pose_errors, PoseErrors as PoseErrors
-from dano.vision.structure._video import (
-    is_video as is_video,
     stretch as stretch,
     timed_frames as timed_frames,
+    VIDEOS as VIDEOS,
     write_frames as write_frames,
 )
+from dano.vision.structure._similarity import pose_errors as pose_errors, PoseErrors as PoseErrors

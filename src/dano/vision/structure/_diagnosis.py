@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.vision.structure._features import FEWEST_MATCHES, Matches, STILL
-from dano.vision.structure._mapping import Model
+from dano.vision.structure._mapping import SparseModel
 from dano.vision.structure._options import FEWEST, PoseOptions
 from dano.vision.structure._photographs import Photograph
 
@@ -234,7 +234,7 @@ def why_none(photographs: Sequence[Photograph], matches: Matches) -> str:
 
 
 def why_left_out(
-    i: int, photographs: Sequence[Photograph], matches: Matches, models: Sequence[Model], chosen: int
+    i: int, photographs: Sequence[Photograph], matches: Matches, models: Sequence[SparseModel], chosen: int
 ) -> str:
     """Why a picture that could be read is not in the chosen model."""
     for number, model in enumerate(models):
@@ -255,7 +255,7 @@ def why_left_out(
 
 
 def doubts(
-    photographs: Sequence[Photograph], models: Sequence[Model], chosen: int, options: PoseOptions
+    photographs: Sequence[Photograph], models: Sequence[SparseModel], chosen: int, options: PoseOptions
 ) -> list[str]:
     """What a user should know of a model that came about."""
     model, found = models[chosen], []

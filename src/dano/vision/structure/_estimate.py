@@ -1,16 +1,21 @@
-"""From pictures to cameras: the whole way."""
+"""From pictures to cameras: the whole way.
 
+`transforms.json`: cameras in the form that nerfstudio writes and `load_capture` reads.
+"""
+
+import json
 import math
 import os
 import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
+from dano.archive import checked_output, replacing
 from dano.checks import checked_items, checked_optional, checked_path
 from dano.progress import Progress
 from dano.vision.capture import PosedCamera
@@ -36,18 +41,20 @@ from dano.vision.structure._gauge import (
     Up,
     world_frame,
 )
-from dano.vision.structure._mapping import find_models, Lens, Model
+from dano.vision.structure._mapping import find_models, Lens, SparseModel
 from dano.vision.structure._markers import detect_markers, place_markers, PlacedMarker
 from dano.vision.structure._options import FEWEST, PoseOptions
 from dano.vision.structure._photographs import (
+    is_video,
     mask_folder,
     Photograph,
     picture_files,
     read_photograph,
+    stretch,
     without_what_stays,
+    write_frames,
 )
 from dano.vision.structure._similarity import Similarity
-from dano.vision.structure._video import is_video, stretch, write_frames
 
 _PLAIN = 6.0
 """Contrast [grey levels] below which surroundings are plain."""
@@ -308,7 +315,7 @@ def _result(
     photographs: list[Photograph],
     left_out: list[tuple[str, str]],
     matches: Matches,
-    models: list[Model],
+    models: list[SparseModel],
     options: PoseOptions,
     on: str,
     told: Progress,
@@ -350,7 +357,7 @@ def _result(
 
 
 def _pictures(
-    shown: list[Photograph], cameras: list[PosedCamera], model: Model, frame: Similarity
+    shown: list[Photograph], cameras: list[PosedCamera], model: SparseModel, frame: Similarity
 ) -> tuple[PosedPicture, ...]:
     pictures = []
     for i, (photograph, camera) in enumerate(zip(shown, cameras, strict=True)):
@@ -420,7 +427,7 @@ def _up(
     shown: list[Photograph],
     cameras: list[PosedCamera],
     markers: list[PlacedMarker],
-    model: Model,
+    model: SparseModel,
     options: PoseOptions,
     warnings: list[str],
 ) -> Up:
@@ -442,7 +449,7 @@ def _up(
     return up
 
 
-def _around_object(shown: list[Photograph], model: Model) -> np.ndarray:
+def _around_object(shown: list[Photograph], model: SparseModel) -> np.ndarray:
     """Points that most pictures show beside the object; all where there are no masks."""
     inside, count = np.zeros(len(model.points)), np.zeros(len(model.points))
     for i, photograph in enumerate(shown):
@@ -455,3 +462,60 @@ def _around_object(shown: list[Photograph], model: Model) -> np.ndarray:
         np.add.at(inside, model.seen[mine, 1], on)
         np.add.at(count, model.seen[mine, 1], 1)
     return model.points[inside <= 0.5 * count]
+
+
+def save_transforms(poses: EstimatedPoses, path: str | Path) -> None:
+    """Write cameras beside what is known of them.
+
+    Pictures are named relative to the file's folder. Additional entries, which other readers skip: `units`
+    ("m", or "arbitrary" where the scale is not known), `scale`, `up`, `left_out`, `models`,
+    `reprojection_error`.
+
+    Args:
+        poses: What `estimate_poses` found.
+        path: Where to, *.json.
+
+    Raises:
+        ValueError: If it cannot be written.
+    """
+    target = checked_output(path)
+    known = poses.scale.metres is not None
+    content = {
+        "camera_model": "OPENCV",
+        "units": "m" if known else "arbitrary",
+        "scale": {"source": poses.scale.source, "relative_error": _finite(poses.scale.error)},
+        "up": {"source": poses.up.source, "error_degrees": _finite(math.degrees(poses.up.error))},
+        "reprojection_error": poses.error,
+        "models": list(poses.models),
+        "left_out": [{"file": name, "reason": reason} for name, reason in poses.left_out],
+        "frames": [_frame(picture, target.resolve().parent) for picture in poses.pictures],
+    }
+    with replacing(target) as file:
+        file.write((json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _frame(picture: PosedPicture, folder: Path) -> dict[str, Any]:
+    camera = picture.camera
+    k1, k2, k3, p1, p2 = (float(k) for k in camera.distortion)
+    pose = np.concatenate([camera.pose, [[0.0, 0.0, 0.0, 1.0]]])
+    masked = {} if picture.mask_file is None else {"mask_path": _relative(picture.mask_file, folder)}
+    return {
+        "file_path": _relative(picture.file, folder),
+        **masked,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": float(camera.focal[0]),
+        "fl_y": float(camera.focal[1]),
+        "cx": float(camera.centre[0]),
+        "cy": float(camera.centre[1]),
+        **{"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2},
+        "transform_matrix": pose.tolist(),
+    }
+
+
+def _relative(file: Path, folder: Path) -> str:
+    return Path(os.path.relpath(file.resolve(), folder)).as_posix()

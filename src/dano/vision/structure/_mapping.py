@@ -36,7 +36,7 @@ class Lens(NamedTuple):
     distortion: tuple[float, float, float, float]
 
 
-class Model(NamedTuple):
+class SparseModel(NamedTuple):
     """Pictures whose cameras are known in one frame, whose scale and orientation mean nothing."""
 
     pictures: tuple[int, ...]  # Their indices
@@ -78,7 +78,7 @@ class Model(NamedTuple):
 
 def find_models(
     matches: Matches, scales: list[float], options: PoseOptions, folder: Path, progress: Progress
-) -> list[Model]:
+) -> list[SparseModel]:
     """Models, the one with most pictures first; empty if there are none.
 
     Args:
@@ -140,7 +140,7 @@ def _attempt(
     return list(found.values())
 
 
-def _model(reconstruction: Any, scales: list[float], options: PoseOptions) -> Model:
+def _model(reconstruction: Any, scales: list[float], options: PoseOptions) -> SparseModel:
     """A reconstruction of COLMAP in numbers."""
     images = sorted(
         (reconstruction.image(key) for key in reconstruction.reg_image_ids()), key=lambda image: image.name
@@ -161,7 +161,7 @@ def _model(reconstruction: Any, scales: list[float], options: PoseOptions) -> Mo
         residuals.append(np.linalg.norm(projected - where, axis=1) / scales[pictures[i]])
     errors = {} if options.focal is not None else _focal_errors(reconstruction)
     freed, gain = (1.0, 1.0) if options.focal is None else _freed(reconstruction)
-    return Model(
+    return SparseModel(
         pictures=pictures,
         cameras=np.array([image.cam_from_world().matrix() for image in images]),
         lenses=tuple(_lens(image.camera, scales[i]) for image, i in zip(images, pictures, strict=True)),

@@ -100,10 +100,13 @@ def pose_errors(
 
 def looked_at(cameras: Sequence[PosedCamera]) -> Float[np.ndarray, "3"]:
     """The point nearest to all optical axes, in the sense of least squares."""
-    total, moved = np.zeros((3, 3)), np.zeros(3)
-    for camera in cameras:
-        forward = camera.axes[2]
-        across = np.eye(3) - np.outer(forward, forward)
-        total += across
-        moved += across @ camera.position
+    total, moved = nearest_to_rays(cameras, [camera.axes[2] for camera in cameras])
     return np.linalg.lstsq(total, moved, rcond=None)[0]
+
+
+def nearest_to_rays(
+    cameras: Sequence[PosedCamera], rays: Sequence[Float[np.ndarray, "3"]]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Matrix and right side of the equations for the point nearest to a ray of each camera."""
+    across = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
+    return across.sum(axis=0), np.einsum("nij,nj->i", across, [camera.position for camera in cameras])

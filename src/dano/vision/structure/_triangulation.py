@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.vision.capture import PosedCamera
+from dano.vision.structure._similarity import nearest_to_rays
 
 _TOLERANCE = 1.0
 """Error of an observation [pixels] from which on it counts less (Huber)."""
@@ -52,12 +53,8 @@ def triangulate(cameras: Sequence[PosedCamera], pixels: Float[np.ndarray, "camer
 
 def _nearest(cameras: Sequence[PosedCamera], pixels: np.ndarray) -> np.ndarray:
     """The point nearest to all rays."""
-    total, moved = np.zeros((3, 3)), np.zeros(3)
-    for camera, pixel in zip(cameras, pixels, strict=True):
-        ray = camera.directions(pixel[None])[0]
-        across = np.eye(3) - np.outer(ray, ray)
-        total += across
-        moved += across @ camera.position
+    rays = [camera.directions(pixel[None])[0] for camera, pixel in zip(cameras, pixels, strict=True)]
+    total, moved = nearest_to_rays(cameras, rays)
     if np.linalg.eigvalsh(total)[0] < 1e-8 * len(cameras):
         raise ValueError("a point cannot be placed: all rays to it are parallel")
     return np.linalg.solve(total, moved)

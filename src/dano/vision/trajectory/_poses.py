@@ -9,17 +9,11 @@ from dano.maths import quat_exp, quat_multiply
 
 
 class Poses(NamedTuple):
-    """Poses of the frames of a film, NaN where there is none.
+    """Poses of the frames of a film, NaN where there is none."""
 
-    Attributes:
-        position: [m, W].
-        orientation: wxyz, F → W.
-        covariance: Of position [m, W] and rotation vector [rad, F].
-    """
-
-    position: Float[np.ndarray, "T 3"]
-    orientation: Float[np.ndarray, "T 4"]
-    covariance: Float[np.ndarray, "T 6 6"]
+    position: Float[np.ndarray, "T 3"]  # [m, W]
+    orientation: Float[np.ndarray, "T 4"]  # wxyz, F → W
+    covariance: Float[np.ndarray, "T 6 6"]  # Of position [m, W] and rotation vector [rad, F]
 
     @property
     def known(self) -> Bool[np.ndarray, " T"]:

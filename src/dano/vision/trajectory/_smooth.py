@@ -16,9 +16,17 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
-from dano.vision.trajectory._flight import AIR, centres_of_mass, Flight, flights, GRAVITY, no_flight
 from dano.vision.trajectory._poses import Poses, stretches
-from dano.vision.trajectory._support import Face, Solid
+from dano.vision.trajectory._support import (
+    AIR,
+    centres_of_mass,
+    Face,
+    Flight,
+    flights,
+    GRAVITY,
+    no_flight,
+    Solid,
+)
 
 _STEADY = 0.004
 """Scale of Cauchy's distribution of third differences of position [sizes] and of rotation [rad], in space."""
@@ -70,46 +78,35 @@ _EPSILON = 1e-6
 
 
 class Smoothed(NamedTuple):
-    """A motion for a whole film.
+    """A motion for a whole film."""
 
-    Attributes:
-        poses: Of all frames that had one.
-        weight: How much of what the frame says was believed, 0 to 1, shape (T,); NaN where there is no pose.
-        supported: Frames in which the object lies or slides on a face, shape (T,).
-        away: What frames by themselves say less the motion: in sizes [W] and [rad, F], shape (T, 6).
-        inflation: Factor by which variances of frames were too small.
-        repeats: In how many poses what one frame says is found again, ≥ 1, shape (T,); NaN where there is
-            none. Poses that frames share have small covariances, but are not independent: with covariances so
-            many times larger they say together, as if they were, what the frames say together.
-    """
-
-    poses: Poses
+    poses: Poses  # Of all frames that had one
+    # How much of what the frame says was believed, 0 to 1, shape (T,); NaN where there is no pose.
     weight: Float[np.ndarray, " T"]
-    supported: Bool[np.ndarray, " T"]
+    supported: Bool[np.ndarray, " T"]  # Frames in which the object lies or slides on a face, shape (T,)
+    # What frames by themselves say less the motion: in sizes [W] and [rad, F], shape (T, 6).
     away: Float[np.ndarray, "T 6"]
-    inflation: float
+    inflation: float  # Factor by which variances of frames were too small
+    # In how many poses what one frame says is found again, ≥ 1, shape (T,); NaN where there is none. Poses
+    # that frames share have small covariances, but are not independent: with covariances so many times larger
+    # they say together, as if they were, what the frames say together.
     repeats: Float[np.ndarray, " T"]
 
 
 class Scenery(NamedTuple):
-    """What is known of a motion beside the frames.
+    """What is known of a motion beside the frames."""
 
-    Attributes:
-        solid: The object.
-        still: Whether it moves between a frame and the next one, shape (T − 1,): True if it does not.
-        table: Height of a level table [m, W]; None: none is known.
-        eye: Where the camera is [m, W]; None: what frames say has no distance in common that may be wrong.
-        scale: Standard deviation of the share by which all frames see it too near or too far, because the
-            object is known too small or too large.
-        alike: How many of their standard deviations all frames may be off alike, because of what is wrong in
-            all of them, such as the object's own shadow beside it.
-    """
-
-    solid: Solid
+    solid: Solid  # The object
+    # Whether it moves between a frame and the next one, shape (T − 1,): True if it does not.
     still: Bool[np.ndarray, " T_minus_1"]
-    table: float | None = None
+    table: float | None = None  # Height of a level table [m, W]; None: none is known
+    # Where the camera is [m, W]; None: what frames say has no distance in common that may be wrong.
     eye: Float[np.ndarray, "3"] | None = None
+    # Standard deviation of the share by which all frames see it too near or too far, because the object is
+    # known too small or too large.
     scale: float = 0.0
+    # How many of their standard deviations all frames may be off alike, because of what is wrong in all of
+    # them, such as the object's own shadow beside it.
     alike: float = 0.0
 
 
