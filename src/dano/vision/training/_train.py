@@ -317,8 +317,8 @@ class _Trainer:
         without, *starts = (
             self.fresh(distance, sharp) for distance in (self.found.hull, *(each.distance for each in worth))
         )
-        error = self._trial(without, rays)
-        errors = [self._trial(start, rays) for start in starts]
+        each = [without, *starts]
+        error, *errors = (self._trial(begun, rays, k, len(each)) for k, begun in enumerate(each))
         return starts[int(np.argmin(errors))] if min(errors) < error else hull
 
     def _tell(self, iteration: int, speed: float) -> None:
@@ -328,12 +328,21 @@ class _Trainer:
             share = iteration / self.options.iterations
             self.progress(f"training, {quality}{speed / 1000:.0f}k rays/s", share)
 
-    def _trial(self, state: _State, rays: RaySet) -> float:
-        """Mean loss of the last of a few steps: translucency deceives a fog, but not a surface."""
-        losses = []
-        for _ in range(max(1, min(_TRIAL, self.switch))):
+    def _trial(self, state: _State, rays: RaySet, number: int, of: int) -> float:
+        """Mean loss of the last of a few steps: translucency deceives a fog, but not a surface.
+
+        Args:
+            state: Where to begin.
+            rays: What is compared.
+            number: Of this trial, for progress.
+            of: How many there are.
+        """
+        losses, steps = [], max(1, min(_TRIAL, self.switch))
+        for i in range(steps):
             state, loss = self.advanced(state, rays)
             losses.append(loss)
+            if self.progress is not None and i % 5 == 0:
+                self.progress("trying cavities", (number + i / steps) / of)
         return float(np.mean(losses[-max(1, len(losses) // 4) :]))
 
     def advanced(self, state: _State, rays: RaySet) -> tuple[_State, float]:
