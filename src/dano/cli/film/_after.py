@@ -224,8 +224,8 @@ def _on_table(
         "velocity": np.append(start["velocity"][:2], 0.0),
         "omega": (quat_to_matrix(start["orientation"]) @ start["omega"])[2] * turn[2],
     }
-    slid = later(flat, _LANDED)
-    for key in ("position", "velocity"):
+    for key in ("velocity", "position"):
+        slid = later(flat, _LANDED)
         flat[key] = flat[key] + np.append((landed[key] - slid[key])[:2], 0.0)
     return flat
 
