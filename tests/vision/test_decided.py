@@ -149,9 +149,10 @@ def test_doubted_pixels_show_what_they_show_or_nothing():
 
 def test_the_doubt_of_an_object_is_that_of_its_training(tmp_path: Path):
     usual = Doubt.of_training(0.0, 0.25)
-    np.testing.assert_allclose(usual, (0.012, 0.006, 0.0025), atol=1e-4)
+    np.testing.assert_allclose(usual, Doubt(), atol=1e-4)
     worse = Doubt.of_training(0.12, 0.25)
-    assert worse.offset == pytest.approx(np.hypot(0.012, 0.02)) and worse.share > 5 * usual.share
+    assert worse.offset == pytest.approx(np.hypot(0.005, 0.01)) and worse.share > 5 * usual.share
+    assert worse.turn == pytest.approx(np.hypot(0.009, 0.03))
     soap = asset_look("trained_soap")
     assert soap is not None and soap.doubt == Doubt()
     soap.doubted(worse).above(0.0).save(tmp_path / "soap.npz")
