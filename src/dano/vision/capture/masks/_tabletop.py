@@ -189,6 +189,8 @@ def pixels(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     column, row = place[:, 0] - 0.5, place[:, 1] - 0.5
     inside = (column > -0.5) & (row > -0.5) & (column < width - 0.5) & (row < height - 0.5)
     seen = (place[:, 2] > 0) & inside & np.isfinite(column) & np.isfinite(row)
+    # What lies behind a camera has no place in its picture.
+    column, row = (np.where(seen, a, 0.0) for a in (column, row))
     return np.clip(column, 0, width - 1), np.clip(row, 0, height - 1), seen
 
 
