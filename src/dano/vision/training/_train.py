@@ -35,6 +35,7 @@ from dano.vision.radiance import Appearance, Doubt, LearnedField, picture, Surfa
 from dano.vision.training import _checkpoint
 from dano.vision.training._adjustment import Adjustment
 from dano.vision.training._cavities import find_cavities, STEPS
+from dano.vision.training._contradicted import differences, sunk
 from dano.vision.training._doubt import with_doubts
 from dano.vision.training._metrics import mask_iou, psnr
 from dano.vision.training._options import TrainOptions
@@ -247,6 +248,16 @@ class _Trainer:
             self.found = found._replace(hull=hull)
             self.views = decided_by_colours(self.views, self.table, Solid(found.box, hull), masks_stay=True)
 
+    def cleared(self, state: _State) -> _State:
+        """The surface without what is in the way of what photographs show, once colours are learned."""
+        model, sharpness = state.model, self.sharpness(state.iteration, float(state.blur))
+        if state.iteration < self.switch:
+            return state
+        views = state.learned.cameras.corrected(self.views)
+        distances = sunk(model.distances, model.box, differences(model, views, sharpness))
+        distance = jnp.asarray(distances / float(model.scale), jnp.float32)
+        return _State(state.learned.moved_to(distance), state.optimiser, state.iteration, state.blur)
+
     def looked_again(self, state: _State) -> None:
         """Take what has been learned for the masks, where colours decide these."""
         assert self.table is not None
@@ -378,6 +389,7 @@ class _Trainer:
                     state = self.refined(state)
                     rays = self._rays(state.iteration)
                 if state.iteration in again:
+                    state = self.cleared(state)
                     self.looked_again(state)
                     rays = self._rays(state.iteration, state.model.distances)
                 begin = time.perf_counter()
