@@ -294,7 +294,7 @@ def test_what_is_wrong_is_said(scene, look):
 
 
 def test_pixels_and_motion_meet_half_way_and_neither_makes_the_other_surer():
-    from dano.pixels._identify import _fused
+    from dano.pixels._identify import _disagreement, _fused
 
     times, turns = np.arange(3.0), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
     width = np.diag([1e-3, 1e-3, 5e-3, 1e-2, 1e-2, 1e-2]) ** 2
@@ -307,17 +307,25 @@ def test_pixels_and_motion_meet_half_way_and_neither_makes_the_other_surer():
         )
 
     told = motion(0.0, 1.0, slice(0, 3))
-    same = _fused(motion(0.004, 1.0, slice(0, 2)), told)
+    same = _fused(motion(0.004, 1.0, slice(0, 2)), told, 1.0)
     assert same.covariance is not None
     assert same.position[:2, 0, 0] == pytest.approx(0.002, rel=1e-9)
     np.testing.assert_allclose(same.covariance[0, 0], width, rtol=1e-9)
     # The third frame is the motion's, which counts half.
     assert same.position[2, 0, 0] == 0.0
     np.testing.assert_allclose(same.covariance[2, 0], 2 * width, rtol=1e-9)
-    # Pixels that seem to be surer are not.
-    surer = _fused(motion(0.004, 1e-4, slice(0, 2)), told)
+    # Those that are surer pull a pose to where they want it, and are half as sure.
+    surer = _fused(motion(0.004, 1e-4, slice(0, 2)), told, 1.0)
     assert surer.covariance is not None
-    np.testing.assert_allclose(surer.covariance[0, 0], width, rtol=1e-9)
+    assert surer.position[0, 0, 0] == pytest.approx(0.004, rel=2e-4)
+    np.testing.assert_allclose(surer.covariance[0, 0], 2e-4 * width, rtol=1e-3)
+    # But frames that disagree with the simulation by more than they say are as sure as that tells: 4 standard
+    # deviations are the median of (4 / 2.31)² times fewer.
+    apart = _disagreement(motion(0.004, 1.0, slice(0, 2)), told)
+    assert apart == pytest.approx(16 / 5.348, rel=1e-3)
+    assert _disagreement(motion(0.001, 1.0, slice(0, 2)), told) == 1.0
+    as_sure = _fused(motion(0.004, 1e-4, slice(0, 2)), told, 1e4)
+    assert as_sure.position[0, 0, 0] == pytest.approx(0.002, rel=1e-9)
     # Those that hardly know leave a pose where it is.
-    vague = _fused(motion(0.004, 1e6, slice(0, 2)), told)
+    vague = _fused(motion(0.004, 1e6, slice(0, 2)), told, 1.0)
     assert np.abs(vague.position[0, 0, 0]) < 1e-8

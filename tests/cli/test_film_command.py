@@ -10,7 +10,7 @@ import pytest
 from vision import sliding_box, tabletop
 
 from dano.cli.film import Film, STAGES
-from dano.cli.film._after import stages_after
+from dano.cli.film._after import _on_table, stages_after
 from dano.cli.film._before import stages_before
 from dano.cli.film._grades import Grade, grades_of, Verdict, verdict_of, write_verdict
 from dano.cli.film._place import place_of
@@ -263,7 +263,7 @@ def test_photographs_with_masks_that_do_not_fit_together_end_it(run, tmp_path: P
     assert "stage masks: silhouettes that no solid explains" in stopped.err
     assert "--force goes on anyway" in stopped.err
     forced = run(*words, "--force")
-    assert "(poor; up to 2 % is usual)" in forced.err and "object (4 of 7): learning" in forced.err
+    assert "(poor; up to 4 % is usual)" in forced.err and "object (4 of 7): learning" in forced.err
 
 
 def test_a_broken_record_is_no_reason_to_fail(kitchen: Kitchen):
@@ -303,6 +303,37 @@ def test_a_slide_that_is_not_there_is_refused():
         find_slide(moving([0.0] * 20))
     with pytest.raises(ValueError, match="6 frames at least after the hand has let go, got"):
         find_slide(moving([0.1 * i for i in range(20)]))
+
+
+def slid(start, n_steps: int, step: float = 0.004, friction: float = 0.3) -> dict[str, np.ndarray]:
+    """A point that falls onto a table and slides there, by Coulomb's law, in NumPy; it does not turn."""
+    position, velocity = start["position"].copy(), start["velocity"].copy()
+    for _ in range(n_steps):
+        velocity[2] -= 9.81 * step
+        pressed = max(-velocity[2] - position[2] / step, 0.0)
+        speed = np.linalg.norm(velocity[:2])
+        velocity[:2] *= max(1 - friction * pressed / max(speed, 1e-9), 0.0)
+        velocity[2] += pressed
+        position = position + step * velocity
+    return {**start, "position": position, "velocity": velocity}
+
+
+def test_a_scene_begins_on_its_table_and_slides_as_far_as_the_fit():
+    hop = {
+        "position": np.array([0.1, -0.2, 1.2e-4]),
+        "orientation": np.array([np.cos(0.3), 0.0, 0.0, np.sin(0.3)]),
+        "velocity": np.array([0.43, 0.21, 0.013]),
+        "omega": np.array([0.2, -0.1, 0.4]),
+    }
+    flat = _on_table(hop, slid)
+    assert flat["position"][2] == pytest.approx(0, abs=1e-12) and flat["velocity"][2] == 0
+    np.testing.assert_allclose(flat["omega"], [0, 0, 0.4], atol=1e-12)
+    ends = [slid(start, 100)["position"] for start in (hop, flat)]
+    way = np.linalg.norm(ends[0] - hop["position"])
+    assert np.linalg.norm(ends[0] - ends[1]) < 0.003 * way
+    # With what falls taken for what rests it is 5 % shorter, or longer.
+    careless = {**hop, "velocity": np.array([0.43, 0.21, -0.026])}
+    assert np.linalg.norm(slid(careless, 100)["position"] - ends[0]) > 0.03 * way
 
 
 @pytest.fixture

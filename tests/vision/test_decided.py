@@ -33,6 +33,7 @@ from dano.vision.capture import (
 )
 from dano.vision.tracking._result import learned_covariance
 from dano.vision.tracking._subject import Subject
+from dano.vision.training._contradicted import sunk
 
 
 @pytest.fixture(scope="module")
@@ -147,11 +148,29 @@ def test_doubted_pixels_show_what_they_show_or_nothing():
     assert len(collect([view.replaced(behind=None)], box, everywhere).mask) == len(all_rays.mask) - 900
 
 
+def test_a_surface_sinks_where_photographs_disagree_with_it():
+    box = NodeGrid.around(np.zeros(3), np.ones(3), 31)
+    wall = (box.nodes[:, 2] - 0.5).reshape(box.shape)
+    apart = np.where(np.abs(wall) < box.spacing, 0.02, np.nan)
+    near = np.isfinite(apart)
+    x, y = (box.nodes[:, i].reshape(box.shape) - 0.5 for i in (0, 1))
+    apart[near & (np.hypot(x, y) < 0.2)] = 0.2
+    # A crumb is noise.
+    apart[2:4, 2, 15] = 0.5
+    after = sunk(wall, box, apart)
+    middle = after[15, 15]
+    height = np.interp(0, middle, np.linspace(0, 1, 31))
+    assert height == pytest.approx(0.5 - 1.5 * box.spacing, abs=0.3 * box.spacing)
+    np.testing.assert_array_equal(after[np.hypot(x, y) > 0.45], wall[np.hypot(x, y) > 0.45])
+    np.testing.assert_array_equal(sunk(wall, box, np.full(box.shape, np.nan)), wall)
+
+
 def test_the_doubt_of_an_object_is_that_of_its_training(tmp_path: Path):
     usual = Doubt.of_training(0.0, 0.25)
-    np.testing.assert_allclose(usual, (0.012, 0.006, 0.0025), atol=1e-4)
+    np.testing.assert_allclose(usual, Doubt(), atol=1e-4)
     worse = Doubt.of_training(0.12, 0.25)
-    assert worse.offset == pytest.approx(np.hypot(0.012, 0.02)) and worse.share > 5 * usual.share
+    assert worse.offset == pytest.approx(np.hypot(0.005, 0.01)) and worse.share > 5 * usual.share
+    assert worse.turn == pytest.approx(np.hypot(0.009, 0.03))
     soap = asset_look("trained_soap")
     assert soap is not None and soap.doubt == Doubt()
     soap.doubted(worse).above(0.0).save(tmp_path / "soap.npz")

@@ -381,6 +381,9 @@ def _missed(scene: Scene, motions: Sequence[Motion], errors: Errors) -> str | No
         noise, way = _noise(motions), _way(motions)
         if not errors.mean_position > max(_FAR_OFF * noise, _OFF_WAY * way) > 0:
             return None
+        if errors.rms < _WITHIN and all(m.covariance is not None for m in motions):
+            # Poses of a learned object are all beside the true ones, which their covariances contain.
+            return None
         return (
             f"the fit misses the observed positions by {1e3 * errors.mean_position:.3g} mm on average, and"
             f" they scatter by {1e3 * noise:.2g} mm: the scene does not move as observed; check frames (is z"
@@ -395,6 +398,9 @@ def _missed(scene: Scene, motions: Sequence[Motion], errors: Errors) -> str | No
 
 _FAR_OFF, _OFF_WAY = 10.0, 0.03
 """A fit that is off by more than so many times the noise and such a share of the way is of another scene."""
+
+_WITHIN = 2.0
+"""Standard deviations up to which a fit is off by no more than the covariances of poses say."""
 
 
 def _noise(motions: Sequence[Motion]) -> float:

@@ -30,6 +30,9 @@ the one before did, and as much is left."""
 _NEARBY = 2.0
 """Standard deviations of what pixels alone say up to which poses agree with them."""
 
+_MEDIAN = 5.35
+"""Median of the square of six normal numbers, by their standard deviations (χ² of six degrees of freedom)."""
+
 _LIGHT_PASSES = 2
 """Passes in which the light is fitted: after that poses are right, and it would only follow the noise."""
 
@@ -82,8 +85,9 @@ def identify_in_film(
     Begins with the parameters that poses of the body give (`identify`). Then the film is rendered at the
     simulated poses, and residuals of silhouettes and colours, weighted robustly, are linearised there: a step
     of Gauss–Newton on pixels, through renderer and simulation, in parameters and initial state. The light is
-    fitted in between. Poses of the motion, which all frames together have made, count as much as what the
-    pixels of a frame say near the simulated one, and neither makes the other surer.
+    fitted in between. Poses of the motion, which all frames together have made, count as well as what the
+    pixels of a frame say near the simulated one, each by its covariance, and neither makes the other surer.
+    Covariances of frames grow until frames disagree with the simulation by no more than they say.
 
     Where most poses lie within two standard deviations of where the pixels want them, and the first step
     moves no value by more than a quarter of its standard error, pixels say what the poses said. The fit of
@@ -138,7 +142,7 @@ def identify_in_film(
         )
         lamps = found.lamps if k + 1 >= _LIGHT_PASSES else None
         alone = Motion.from_tracked(found, body)
-        pulled = _fused(alone, motion)
+        pulled = _fused(alone, motion, _disagreement(alone, seen))
         last = fit
         fit = identify(
             scene, pulled, parameters, after=fit, progress=progress, options=on_the_way, **settings
@@ -160,11 +164,7 @@ def _agree(pulled: Motion, motion: Motion) -> bool:
     """Whether poses of a motion lie where the pixels want them, by what pixels alone know."""
     assert pulled.covariance is not None
     known, seen = _information(pulled.covariance[:, 0])
-    seen &= np.isfinite(motion.position[:, 0]).all(axis=1)
-    turn = quat_log(quat_multiply(quat_conjugate(pulled.orientation[seen, 0]), motion.orientation[seen, 0]))
-    apart = np.concatenate([motion.position[seen, 0] - pulled.position[seen, 0], turn], axis=1)
-    square = np.einsum("ni,nij,nj->n", apart, known[seen], apart) / 6
-    return bool(seen.any()) and float(np.median(square)) < _NEARBY**2
+    return bool(seen.any()) and _median_square(motion, pulled, known, seen) < 6 * _NEARBY**2
 
 
 def _no_smaller(fit: Identification, before: Identification) -> Identification:
@@ -195,31 +195,62 @@ def _with_table(scene: Scene, motion: Motion, options: TrackOptions) -> TrackOpt
     return dataclasses.replace(options, table=max(below)) if below else options
 
 
-def _fused(pulled: Motion, motion: Motion) -> Motion:
+def _disagreement(pulled: Motion, simulated: Motion) -> float:
+    """By how much variances of single frames are too small, at least 1.
+
+    A frame by itself does not know how far frames disagree: that is by how much the poses to which their
+    pixels pull lie beside one motion, in the median of the frames.
+    """
+    assert pulled.covariance is not None
+    known, seen = _information(pulled.covariance[:, 0])
+    return max(1.0, _median_square(simulated, pulled, known, seen) / _MEDIAN)
+
+
+def _fused(pulled: Motion, motion: Motion, disagreement: float) -> Motion:
     """Poses that pixels pull to together with those of a motion of the same film, by covariance intersection.
 
     Both say what the same pixels show, one frame by frame, the other in the light of all frames: half of what
     each says is never too sure (Julier and Uhlmann 1997). Without the motion nothing holds a pose along the
     line of sight, and a slide may hop there.
+
+    Args:
+        pulled: What pixels want.
+        motion: That of all frames.
+        disagreement: Factor of the covariances of the former.
     """
     assert pulled.covariance is not None
     if motion.covariance is None:
         return pulled
-    here, seen = _information(pulled.covariance[:, 0])
+    here, seen = _information(disagreement * pulled.covariance[:, 0])
     there, told = _information(motion.covariance[:, 0])
     both, some = seen & told, seen | told
-    here[both] = _no_surer(here[both], there[both])
     covariance = np.full(pulled.covariance.shape, np.nan)
     covariance[some, 0] = np.linalg.inv(0.5 * (here + there)[some])
     # A frame in which pixels say nothing is that of the motion.
     position = np.where(seen[:, None, None], pulled.position, motion.position)
     orientation = np.where(seen[:, None, None], pulled.orientation, motion.orientation)
-    turn = quat_log(quat_multiply(quat_conjugate(orientation[both, 0]), motion.orientation[both, 0]))
-    apart = np.concatenate([motion.position[both, 0] - position[both, 0], turn], axis=1)
+    apart = _apart(motion, dataclasses.replace(pulled, position=position, orientation=orientation), both)
     step = 0.5 * np.einsum("nij,njk,nk->ni", covariance[both, 0], there[both], apart)
     position[both, 0] += step[:, :3]
     orientation[both, 0] = quat_multiply(orientation[both, 0], quat_exp(step[:, 3:]))
     return dataclasses.replace(pulled, position=position, orientation=orientation, covariance=covariance)
+
+
+def _apart(one: Motion, other: Motion, rows: np.ndarray) -> np.ndarray:
+    """How far some poses of a motion are from those of another, as `Tracked.covariance` counts (n, 6)."""
+    turn = quat_log(quat_multiply(quat_conjugate(other.orientation[rows, 0]), one.orientation[rows, 0]))
+    return np.concatenate([one.position[rows, 0] - other.position[rows, 0], turn], axis=1)
+
+
+def _median_square(one: Motion, other: Motion, known: np.ndarray, rows: np.ndarray) -> float:
+    """Median square of how far poses are apart, by the information of the other one's (n, 6, 6).
+
+    0 if there is none.
+    """
+    rows = rows & np.isfinite(one.position[:, 0]).all(axis=1)
+    apart = _apart(one, other, rows)
+    square = np.einsum("ni,nij,nj->n", apart, known[rows], apart)
+    return float(np.median(square)) if len(square) else 0.0
 
 
 def _information(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -228,18 +259,6 @@ def _information(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     inverse = np.zeros(covariance.shape)
     inverse[known] = np.linalg.inv(covariance[known])
     return inverse, known
-
-
-def _no_surer(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Information (n, 6, 6), in no direction more than another.
-
-    A single frame does not know how far frames disagree.
-    """
-    root = np.linalg.cholesky(other)
-    inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ one @ inverse.swapaxes(-1, -2))
-    part = root @ vectors * np.sqrt(np.clip(values, 0.0, 1.0))[..., None, :]
-    return part @ part.swapaxes(-1, -2)
 
 
 def _moved(before: Identification, after: Identification) -> float:

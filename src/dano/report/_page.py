@@ -45,7 +45,7 @@ def write_grades(
             ("story.html", "the film beside the simulation"),
         )
     )
-    head = ["stage", "number", "value"]
+    head = ["stage", "its number", "value"]
     write_page(
         path,
         title,

@@ -103,7 +103,7 @@ def _cameras(place: Place) -> Grade:
 
 def _masks(place: Place) -> Grade:
     found = read_json(place.folder / "fit.json")["residual"]
-    return Grade("masks", "silhouettes that no solid explains", float(found), 0.02, 0.12)
+    return Grade("masks", "silhouettes that no solid explains", float(found), 0.04, 0.12)
 
 
 def _object(place: Place) -> Grade:

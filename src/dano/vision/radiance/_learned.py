@@ -26,8 +26,8 @@ _EDGE = 2.0
 class Doubt(NamedTuple):
     """Standard deviations of what a learned object is beside the true one, in all pictures of it."""
 
-    offset: float = 0.01  # Of its middle, along each axis, as a share of its size
-    turn: float = 6e-3  # [rad]
+    offset: float = 0.005  # Of its middle, along each axis, as a share of its size
+    turn: float = 9e-3  # About each axis [rad]
     share: float = 2.5e-3  # By which it is too large, and so seems too near
 
     @staticmethod
@@ -35,18 +35,18 @@ class Doubt(NamedTuple):
         """What training knows of it.
 
         A rim of width δ around a disc of diameter 1 is 4 δ of its area. So silhouettes of which a share u is
-        not explained are, if all of that is on one side, off by u/4: a third of which is taken for what an
-        axis has (an estimate: it was compared with one solid whose truth is known). Nobody photographs what
-        an object stands on, usually a quarter of its surface: with nothing unexplained the numbers are those
-        of a `Doubt()`.
+        not explained are, if all of that is on one side, off by u/4, or turned by about as much. Nobody
+        photographs what an object stands on, usually a quarter of its surface: with nothing unexplained the
+        numbers are those of a `Doubt()`. Factors were fitted to what the frames of films share whose poses
+        are known (docs/track.md).
 
         Args:
             unexplained: Share of the silhouettes that the object does not explain.
             unseen: Share of its surface that fewer than two photographs show.
         """
         return Doubt(
-            float(np.hypot(0.002 + 0.04 * unseen, unexplained / 6)),
-            float(np.hypot(0.001 + 0.02 * unseen, unexplained / 6)),
+            float(np.hypot(0.001 + 0.016 * unseen, unexplained / 12)),
+            float(np.hypot(0.0015 + 0.03 * unseen, unexplained / 4)),
             float(np.hypot(2.5e-3, unexplained / 8)),
         )
 

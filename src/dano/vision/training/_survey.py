@@ -17,9 +17,9 @@ from dano.vision.training._metrics import mask_iou
 BAD_RESIDUAL = 0.03
 """Share of the silhouettes that may fail to fit the hull before something must be wrong."""
 
-_ONE_SIDE = np.radians(110)
+_ONE_SIDE = np.radians(130)
 """Gap [rad] from which views are all from one side; photographs of something that stands on a table, from all
-around and above, leave 90°."""
+around and up to 40° above, leave 90° to 130° below."""
 
 _MARGIN = 0.04
 """Kept free around the hull, as a share of its longest side."""

@@ -35,6 +35,7 @@ from dano.vision.radiance import Appearance, Doubt, LearnedField, picture, Surfa
 from dano.vision.training import _checkpoint
 from dano.vision.training._adjustment import Adjustment
 from dano.vision.training._cavities import find_cavities, STEPS
+from dano.vision.training._contradicted import differences, sunk
 from dano.vision.training._doubt import with_doubts
 from dano.vision.training._metrics import mask_iou, psnr
 from dano.vision.training._options import TrainOptions
@@ -247,6 +248,16 @@ class _Trainer:
             self.found = found._replace(hull=hull)
             self.views = decided_by_colours(self.views, self.table, Solid(found.box, hull), masks_stay=True)
 
+    def cleared(self, state: _State) -> _State:
+        """The surface without what is in the way of what photographs show, once colours are learned."""
+        model, sharpness = state.model, self.sharpness(state.iteration, float(state.blur))
+        if state.iteration < self.switch:
+            return state
+        views = state.learned.cameras.corrected(self.views)
+        distances = sunk(model.distances, model.box, differences(model, views, sharpness))
+        distance = jnp.asarray(distances / float(model.scale), jnp.float32)
+        return _State(state.learned.moved_to(distance), state.optimiser, state.iteration, state.blur)
+
     def looked_again(self, state: _State) -> None:
         """Take what has been learned for the masks, where colours decide these."""
         assert self.table is not None
@@ -317,8 +328,8 @@ class _Trainer:
         without, *starts = (
             self.fresh(distance, sharp) for distance in (self.found.hull, *(each.distance for each in worth))
         )
-        error = self._trial(without, rays)
-        errors = [self._trial(start, rays) for start in starts]
+        each = [without, *starts]
+        error, *errors = (self._trial(begun, rays, k, len(each)) for k, begun in enumerate(each))
         return starts[int(np.argmin(errors))] if min(errors) < error else hull
 
     def _tell(self, iteration: int, speed: float) -> None:
@@ -328,12 +339,21 @@ class _Trainer:
             share = iteration / self.options.iterations
             self.progress(f"training, {quality}{speed / 1000:.0f}k rays/s", share)
 
-    def _trial(self, state: _State, rays: RaySet) -> float:
-        """Mean loss of the last of a few steps: translucency deceives a fog, but not a surface."""
-        losses = []
-        for _ in range(max(1, min(_TRIAL, self.switch))):
+    def _trial(self, state: _State, rays: RaySet, number: int, of: int) -> float:
+        """Mean loss of the last of a few steps: translucency deceives a fog, but not a surface.
+
+        Args:
+            state: Where to begin.
+            rays: What is compared.
+            number: Of this trial, for progress.
+            of: How many there are.
+        """
+        losses, steps = [], max(1, min(_TRIAL, self.switch))
+        for i in range(steps):
             state, loss = self.advanced(state, rays)
             losses.append(loss)
+            if self.progress is not None and i % 5 == 0:
+                self.progress("trying cavities", (number + i / steps) / of)
         return float(np.mean(losses[-max(1, len(losses) // 4) :]))
 
     def advanced(self, state: _State, rays: RaySet) -> tuple[_State, float]:
@@ -369,6 +389,7 @@ class _Trainer:
                     state = self.refined(state)
                     rays = self._rays(state.iteration)
                 if state.iteration in again:
+                    state = self.cleared(state)
                     self.looked_again(state)
                     rays = self._rays(state.iteration, state.model.distances)
                 begin = time.perf_counter()

@@ -8,6 +8,7 @@ sight in all frames alike. Weights of frames, of differences and of what a table
 and Cauchy's distributions, found again in every step (iteratively reweighted least squares).
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -300,15 +301,14 @@ class _Problem:
         if len(self._resting):
             parts.append(self._rest(poses))
         rows = [self._said(poses, shared[-7:], width)]
-        rows += [_spread(frames, slopes, residual, width) for frames, slopes, residual in parts]
+        rows += [_spread(frames, slopes, residual) for frames, slopes, residual in parts]
         for k, run in enumerate(self._runs):
-            rows.append(self._lying(poses, run, shared[3 * k : 3 * k + 3], 6 * n + 3 * k, width))
+            rows.append(self._lying(poses, run, shared[3 * k : 3 * k + 3], 6 * n + 3 * k))
         if len(self._flight.threes):
             column = 3 * len(self._runs)
-            rows.append(self._falling(poses, shared[column : column + 3], 6 * n + column, width))
+            rows.append(self._falling(poses, shared[column : column + 3], 6 * n + column))
         rows.append(self._prior(shared, width))
-        matrices, residuals = zip(*rows, strict=True)
-        return sparse.vstack(matrices).tocsr(), np.concatenate(residuals)
+        return _joined(rows, width), np.concatenate([part.residual for part in rows])
 
     @property
     def _doubts(self) -> Float[np.ndarray, " m"]:
@@ -317,7 +317,7 @@ class _Problem:
         falling = np.full(3 if len(self._flight.threes) else 0, _LOADED)
         return np.concatenate([lying, falling, self._alike])
 
-    def _prior(self, shared: np.ndarray, width: int):
+    def _prior(self, shared: np.ndarray, width: int) -> "_Part":
         """How far a learned object may differ from the true one; a face as by Student's distribution.
 
         Nobody photographs what an object stands on. If frames say that a face is far more tilted than a true
@@ -330,10 +330,9 @@ class _Problem:
         self._cost += cost + 0.5 * float(np.sum((known * shared)[faces.size :] ** 2))
         known[: faces.size] *= np.repeat(np.sqrt(weight), 3)
         rows = np.arange(len(shared))
-        matrix = sparse.csr_matrix((known, (rows, width - len(shared) + rows)), shape=(len(shared), width))
-        return matrix, known * shared
+        return _Part(known, rows, width - len(shared) + rows, known * shared)
 
-    def _said(self, poses: Poses, alike: Float[np.ndarray, "7"], width: int):
+    def _said(self, poses: Poses, alike: Float[np.ndarray, "7"], width: int) -> "_Part":
         """What frames say, weighted as by Student's distribution."""
 
         def away(moved: Poses, alike: np.ndarray = alike) -> np.ndarray:
@@ -348,7 +347,7 @@ class _Problem:
         part = self._linear(away, poses, np.arange(len(square))[:, None], root)
         slopes = [away(poses, alike + _EPSILON * e) - residual for e in np.eye(7)]
         common = np.stack([(root * slope).ravel() / _EPSILON for slope in slopes], axis=1)
-        return _with_shared(_spread(*part, width), common, width - 7)
+        return _with_shared(_spread(*part), common, width - 7)
 
     def _steady(self, poses: Poses):
         """Third differences, weighted as by Cauchy's distribution: a blow is allowed."""
@@ -391,7 +390,7 @@ class _Problem:
         slopes = np.stack([part.transpose(0, 2, 1) for part in mine], axis=2)
         return frames, slopes * root[:, :, None, None], value * root
 
-    def _lying(self, poses: Poses, run: _Run, shared: np.ndarray, column: int, width: int):
+    def _lying(self, poses: Poses, run: _Run, shared: np.ndarray, column: int) -> "_Part":
         """Height and tilt of a face over the table, beside where all frames of the run have it."""
         rows, face, size = run.rows, run.face, self._solid.size
         side = np.cross(face.down, np.eye(3)[np.argmin(np.abs(face.down))])
@@ -407,9 +406,9 @@ class _Problem:
             return np.concatenate([(height / size - base[0]) / _LEVEL, towards[..., :2] / _FLAT], axis=-1)
 
         # What rocks, or has left the table for a moment, does not lie there.
-        return self._allowing(off, poses, shared, rows[:, None], column, width)
+        return self._allowing(off, poses, shared, rows[:, None], column)
 
-    def _falling(self, poses: Poses, shared: np.ndarray, column: int, width: int):
+    def _falling(self, poses: Poses, shared: np.ndarray, column: int) -> "_Part":
         """Acceleration of the centre of mass less g, by Cauchy's distribution: something may push it."""
         (threes, rates), size = self._flight, self._solid.size
 
@@ -417,9 +416,9 @@ class _Problem:
             com = centres_of_mass(moved, self._solid.com + size * beside)
             return (np.einsum("mk,...mki->...mi", rates, com[..., threes, :]) - GRAVITY) / AIR
 
-        return self._allowing(pushed, poses, shared, threes, column, width)
+        return self._allowing(pushed, poses, shared, threes, column)
 
-    def _allowing(self, function, poses: Poses, shared, frames: np.ndarray, column: int, width: int):
+    def _allowing(self, function, poses: Poses, shared, frames: np.ndarray, column: int) -> "_Part":
         """Residuals of frames and three numbers that they share, by Cauchy's distribution, and derivatives.
 
         Args:
@@ -428,7 +427,6 @@ class _Problem:
             shared: The numbers.
             frames: Which frames each residual depends on, shape (m, k).
             column: Of the first of the numbers.
-            width: Of the matrix.
         """
         plain = function(poses, shared)
         square = np.sum(plain**2, axis=1)
@@ -437,7 +435,7 @@ class _Problem:
         part = self._linear(lambda moved: function(moved, shared), poses, frames, root)
         slopes = [(function(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
         common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
-        return _with_shared(_spread(*part, width), common, column)
+        return _with_shared(_spread(*part), common, column)
 
 
 def _by_student(square: Float[np.ndarray, " n"], count: int) -> tuple[Float[np.ndarray, " n"], float]:
@@ -446,22 +444,39 @@ def _by_student(square: Float[np.ndarray, " n"], count: int) -> tuple[Float[np.n
     return weight, 0.5 * (_FREEDOM + count) * float(np.sum(np.log1p(square / _FREEDOM)))
 
 
-def _with_shared(part, slopes: Float[np.ndarray, "m k"], column: int):
+class _Part(NamedTuple):
+    """Some rows of a Jacobian: what is not zero of them, where it is, and their residuals."""
+
+    values: Float[np.ndarray, " n"]
+    rows: Int[np.ndarray, " n"]  # Counted from the first one of this part
+    columns: Int[np.ndarray, " n"]
+    residual: Float[np.ndarray, " m"]
+
+
+def _joined(parts: Sequence[_Part], width: int):
+    """The sparse matrix of all rows: put together once, as sums of small sparse matrices take long."""
+    heights = [len(part.residual) for part in parts]
+    first = np.repeat(np.cumsum([0, *heights[:-1]]), [len(part.values) for part in parts])
+    values, rows, columns = (np.concatenate(column) for column in list(zip(*parts, strict=True))[:3])
+    return sparse.csr_matrix((values, (first + rows, columns)), shape=(sum(heights), width))
+
+
+def _with_shared(part: _Part, slopes: Float[np.ndarray, "m k"], column: int) -> _Part:
     """Derivatives by poses, and residuals, with those by what frames share, from a column on."""
-    matrix, residual = part
     m, k = slopes.shape
-    place = np.repeat(np.arange(m), k), np.tile(column + np.arange(k), m)
-    return matrix + sparse.csr_matrix((slopes.ravel(), place), shape=matrix.shape), residual
+    return part._replace(
+        values=np.concatenate([part.values, slopes.ravel()]),
+        rows=np.concatenate([part.rows, np.repeat(np.arange(m), k)]),
+        columns=np.concatenate([part.columns, np.tile(column + np.arange(k), m)]),
+    )
 
 
-def _spread(frames: np.ndarray, slopes: np.ndarray, residual: np.ndarray, width: int):
-    """A sparse matrix of derivatives by all frames, and residuals in one column."""
+def _spread(frames: np.ndarray, slopes: np.ndarray, residual: np.ndarray) -> _Part:
+    """Derivatives by all frames, and residuals."""
     m, r, k, _ = slopes.shape
-    columns = 6 * frames[:, None, :, None] + np.arange(6)
-    columns = np.broadcast_to(columns, (m, r, k, 6))
+    columns = np.broadcast_to(6 * frames[:, None, :, None] + np.arange(6), (m, r, k, 6))
     rows = np.broadcast_to(np.arange(m * r).reshape(m, r, 1, 1), (m, r, k, 6))
-    matrix = sparse.csr_matrix((slopes.ravel(), (rows.ravel(), columns.ravel())), shape=(m * r, width))
-    return matrix, residual.ravel()
+    return _Part(slopes.ravel(), rows.ravel(), columns.ravel(), residual.ravel())
 
 
 def _block(inverse, k: int, width: int) -> Float[np.ndarray, "6 6"]:

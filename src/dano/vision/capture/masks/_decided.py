@@ -15,11 +15,15 @@ from dano.vision.capture.masks._tabletop import shown_by, Tabletop
 _BAND = 0.1
 """Half the width of the band around an outline in which colours decide, over the root of its area."""
 
-_LIKE = 0.1
-"""Difference [sRGB] from what is behind up to which a pixel may show that."""
+_LIKE = 0.12
+"""Difference [sRGB] from what is behind up to which a pixel may show that, blurred over neighbours: letters
+are a quarter of a pixel beside."""
 
-_AROUND = 1.5
-"""Half the side of the table's picture, over the longest side of the object."""
+_HOLE = 2
+"""Least width of what may be a hole [pixels]."""
+
+_AROUND, _FURTHEST = 1.5, 3.0
+"""Half the side of the table's picture, over the longest side of the object: least, and most."""
 
 
 class Solid(NamedTuple):
@@ -50,8 +54,9 @@ def decided_by_colours(
     hidden = [(a > 0.5) & (b > 0.5) for a, b in zip(shown, covered, strict=True)]
     nodes = np.argwhere(solid.distance < 0)
     low, high = (solid.box.origin + solid.box.spacing * edge for edge in (nodes.min(0), nodes.max(0)))
-    middle, half = 0.5 * (low + high)[:2], _AROUND * float((high - low).max())
-    top = Tabletop.of(views, hidden, table, middle - half, 2 * half)
+    middle, size = 0.5 * (low + high)[:2], float((high - low).max())
+    half = np.clip(_behind(views, table, low, high, middle), _AROUND * size, _FURTHEST * size)
+    top = Tabletop.of(views, hidden, table, middle - half, 2 * half, fine=half / (_AROUND * size))
     found = []
     for view, mask, share, gain in zip(views, covered, shown, top.gain, strict=True):
         behind = shown_by(view, top, gain)
@@ -62,10 +67,31 @@ def decided_by_colours(
     return found
 
 
+def _behind(
+    views: Sequence[View],
+    table: float,
+    low: Float[np.ndarray, "3"],
+    high: Float[np.ndarray, "3"],
+    middle: Float[np.ndarray, "2"],
+) -> float:
+    """How far from a place on the table rays past an object's top still meet it [m].
+
+    Through a hole under a handle a photograph from low down shows what is far behind.
+    """
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+    reach = [0.0]
+    for view in views:
+        eye = view.camera.position
+        down = np.maximum(eye[2] - corners[:, 2], 1e-6)
+        met = eye + (eye[2] - table) / down[:, None] * (corners - eye)
+        reach.append(float(np.abs(met[:, :2] - middle).max()) if eye[2] > high[2] else np.inf)
+    return float(np.quantile(reach, 0.9))
+
+
 def _like(view: View, behind: np.ndarray) -> Bool[np.ndarray, "height width"]:
     """Where a photograph shows what is behind the object, as through a hole, or looks like that."""
-    apart = np.abs(np.nan_to_num(behind, nan=9.0) - view.image).max(axis=-1)
-    return ndimage.binary_opening(ndimage.gaussian_filter(apart, 0.7) < _LIKE)
+    apart = ndimage.gaussian_filter(np.nan_to_num(behind, nan=9.0) - view.image, (0.7, 0.7, 0))
+    return ndimage.binary_opening(np.abs(apart).max(axis=-1) < _LIKE, np.ones((_HOLE, _HOLE)))
 
 
 def _around(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:

@@ -56,6 +56,8 @@ class Tabletop(NamedTuple):
         height: float,
         corner: Float[np.ndarray, "2"],
         side: float,
+        *,
+        fine: float = 1.0,
     ) -> "Tabletop":
         """The median of photographs, brought to one brightness.
 
@@ -65,9 +67,11 @@ class Tabletop(NamedTuple):
             height: z of the table [m, W].
             corner: Least x and y [m, W] of the square that is looked at.
             side: Its length [m].
+            fine: How many times more cells than usual it has along an axis.
         """
-        spacing = side / (_CELLS - 1)
-        y, x = np.mgrid[:_CELLS, :_CELLS] * spacing
+        n = round(fine * _CELLS)
+        spacing = side / (n - 1)
+        y, x = np.mgrid[:n, :n] * spacing
         points = np.stack([corner[0] + x.ravel(), corner[1] + y.ravel(), np.full(x.size, height)], axis=1)
         seen = np.stack(
             [_colours(v, points, None if hidden is None else hidden[i]) for i, v in enumerate(views)]
@@ -79,9 +83,9 @@ class Tabletop(NamedTuple):
         even = (seen / gain[:, None]).astype(np.float32)
         level = _median(even)
         varies = _median(np.abs(even - level))
-        few = (np.isfinite(seen[..., 0]).sum(axis=0) < _FEWEST).reshape(_CELLS, _CELLS, 1)
-        varies = np.where(few, np.inf, varies.reshape(_CELLS, _CELLS, 3))
-        level = level.reshape(_CELLS, _CELLS, 3)
+        few = (np.isfinite(seen[..., 0]).sum(axis=0) < _FEWEST).reshape(n, n, 1)
+        varies = np.where(few, np.inf, varies.reshape(n, n, 3))
+        level = level.reshape(n, n, 3)
         colours = np.where(few, np.nan, level).astype(np.float32)
         level = features(np.nan_to_num(level))
         # Places are wrong by a cell.
@@ -147,7 +151,7 @@ def _cells(view: View, top: Tabletop) -> tuple[Float[np.ndarray, "n 2"], Bool[np
     rays, eye = view.camera.rays().reshape(-1, 3), view.camera.position
     away = (top.height - eye[2]) / np.where(rays[:, 2] < -1e-6, rays[:, 2], np.nan)
     place = ((eye + away[:, None] * rays)[:, :2] - top.corner) / top.spacing
-    inside = (away > 0) & (place >= 0).all(axis=1) & (place <= _CELLS - 1).all(axis=1)
+    inside = (away > 0) & (place >= 0).all(axis=1) & (place <= len(top.level) - 1).all(axis=1)
     return np.where(inside[:, None], place, 0), inside
 
 
@@ -185,6 +189,8 @@ def pixels(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     column, row = place[:, 0] - 0.5, place[:, 1] - 0.5
     inside = (column > -0.5) & (row > -0.5) & (column < width - 0.5) & (row < height - 0.5)
     seen = (place[:, 2] > 0) & inside & np.isfinite(column) & np.isfinite(row)
+    # What lies behind a camera has no place in its picture.
+    column, row = (np.where(seen, a, 0.0) for a in (column, row))
     return np.clip(column, 0, width - 1), np.clip(row, 0, height - 1), seen
 
 
