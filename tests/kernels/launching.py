@@ -68,7 +68,9 @@ class Arguments:
         for place, rows in filled.items():
             self.put(place, rows)
         of_moving = "momentum inertia meetings velocity tried best step residual scale moved".split()
-        of_rows = "order counts neighbours degrees islands members parts begins ends rests asleep".split()
+        of_rows = (
+            "order counts neighbours degrees islands members of_islands begins ends rests asleep".split()
+        )
         lengths = {
             **dict.fromkeys(("bodies", "partners", "sizes"), n),
             **dict.fromkeys(("found", "sorted_pairs"), len(pairs)),

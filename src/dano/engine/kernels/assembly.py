@@ -283,8 +283,8 @@ def add_momentum(
     end = scene.moving.shape[0]
     if wp.static(ISLANDS):
         if island != EVERYWHERE:
-            first = room.parts[world, island].first
-            end = room.parts[world, island].end
+            first = room.of_islands[world, island].first
+            end = room.of_islands[world, island].end
     for e in range(first + lane, end, _LANES):
         i = member(room, world, island, e)
         b = i

@@ -40,7 +40,7 @@ def part_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: int, 
         part.end_pair = n_found
         part.end_block = room.lasting[world, 0].blocks
     else:
-        part = room.parts[world, island]
+        part = room.of_islands[world, island]
     return part
 
 
@@ -80,13 +80,13 @@ def find_islands(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: 
     for i in range(m):
         if room.islands[world, i] < 0:
             room.islands[world, i] = i
-            room.parts[world, i] = Island()
+            room.of_islands[world, i] = Island()
             room.members[world, 0] = i
             waiting = int(1)
             while waiting > 0:
                 waiting -= 1
                 k = room.members[world, waiting]
-                room.parts[world, i].end = room.parts[world, i].end + 1
+                room.of_islands[world, i].end = room.of_islands[world, i].end + 1
                 for e in range(room.neighbours[world, k]):
                     j = room.beside[world, k * m + e]
                     if room.islands[world, j] < 0:
@@ -95,28 +95,28 @@ def find_islands(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: 
                         waiting += 1
     for f in range(n_found):
         island = island_of(scene, room, world, f)
-        room.parts[world, island].end_pair = room.parts[world, island].end_pair + 1
+        room.of_islands[world, island].end_pair = room.of_islands[world, island].end_pair + 1
     first = int(0)
     first_pair = int(0)
     for i in range(m):
         if room.islands[world, i] == i:
-            part = room.parts[world, i]
-            room.parts[world, i].first = first
-            room.parts[world, i].first_pair = first_pair
-            room.parts[world, i].end = first
-            room.parts[world, i].end_pair = first_pair
+            part = room.of_islands[world, i]
+            room.of_islands[world, i].first = first
+            room.of_islands[world, i].first_pair = first_pair
+            room.of_islands[world, i].end = first
+            room.of_islands[world, i].end_pair = first_pair
             first += part.end
             first_pair += part.end_pair
     for i in range(m):
         island = room.islands[world, i]
-        at = room.parts[world, island].end
+        at = room.of_islands[world, island].end
         room.members[world, at] = i
-        room.parts[world, island].end = at + 1
+        room.of_islands[world, island].end = at + 1
     for f in range(n_found):
         island = island_of(scene, room, world, f)
-        at = room.parts[world, island].end_pair
+        at = room.of_islands[world, island].end_pair
         room.sorted_pairs[world, at] = f
-        room.parts[world, island].end_pair = at + 1
+        room.of_islands[world, island].end_pair = at + 1
 
 
 @wp.func
@@ -164,11 +164,11 @@ def find_pattern(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_found: 
         find_islands(scene, room, world, n_found)
         for i in range(m):
             if room.islands[world, i] == i:
-                part = room.parts[world, i]
-                room.parts[world, i].first_block = room.lasting[world, 0].blocks
+                part = room.of_islands[world, i]
+                room.of_islands[world, i].first_block = room.lasting[world, 0].blocks
                 order_blocks(room, world, m, part.first, part.end, i)
                 list_blocks(room, world, m, part.first, part.end, i)
-                room.parts[world, i].end_block = room.lasting[world, 0].blocks
+                room.of_islands[world, i].end_block = room.lasting[world, 0].blocks
     else:
         order_blocks(room, world, m, 0, m, EVERYWHERE)
         list_blocks(room, world, m, 0, m, EVERYWHERE)
@@ -288,8 +288,8 @@ def solve_blocks(room: wp.ref[Room], world: int, lane: int, m: int, island: int)
     end = int(m)
     if wp.static(ISLANDS):
         if island != EVERYWHERE:
-            first = room.parts[world, island].first
-            end = room.parts[world, island].end
+            first = room.of_islands[world, island].first
+            end = room.of_islands[world, island].end
     for s in range(first, end):
         k = room.order[world, s]
         if k >= 0:
@@ -371,8 +371,8 @@ def copy_blocks(room: wp.ref[Room], world: int, lane: int, m: int, island: int):
     end = room.lasting[world, 0].blocks
     if wp.static(ISLANDS):
         if island != EVERYWHERE:
-            first = room.parts[world, island].first_block
-            end = room.parts[world, island].end_block
+            first = room.of_islands[world, island].first_block
+            end = room.of_islands[world, island].end_block
     for k in range(first + lane, end, _LANES):
         room.spare[world, k] = room.blocks[world, k]
 

@@ -106,7 +106,7 @@ def wake_near(scene: wp.ref[Scene], room: wp.ref[Room], world: int, candidates: 
 @wp.func
 def is_still(scene: wp.ref[Scene], room: wp.ref[Room], world: int, island: int) -> bool:
     """Whether an island that was solved rests on something fixed, and moves by rounding only."""
-    part = room.parts[world, island]
+    part = room.of_islands[world, island]
     on_fixed = bool(False)
     for e in range(part.first_pair, part.end_pair):
         index = scene.pair_index[room.found[world, room.sorted_pairs[world, e]].pair]
@@ -123,7 +123,7 @@ def is_still(scene: wp.ref[Scene], room: wp.ref[Room], world: int, island: int) 
 @wp.func
 def began_at_rest(scene: wp.ref[Scene], room: wp.ref[Room], world: int, island: int) -> bool:
     """Whether all bodies of an island had no velocity at all when the step began."""
-    part = room.parts[world, island]
+    part = room.of_islands[world, island]
     rested = bool(True)
     for e in range(part.first, part.end):
         state = room.bodies[world, scene.moving[room.members[world, e]]]
@@ -139,7 +139,7 @@ def fall_asleep(scene: wp.ref[Scene], room: wp.ref[Room], world: int, converged:
             if room.islands[world, i] == i and not sleeps(room, world, i):
                 rests = converged and is_still(scene, room, world, i)
                 stays = rests and began_at_rest(scene, room, world, i)
-                part = room.parts[world, i]
+                part = room.of_islands[world, i]
                 for e in range(part.first, part.end):
                     k = room.members[world, e]
                     room.rests[world, k] = wp.where(rests, 1, 0)

@@ -75,7 +75,7 @@ class SamplePair:
 
 @wp.struct
 class PairIndex:
-    """Whole numbers of a pair: its bodies, and where its numbers stand, which it shares with pairs alike."""
+    """Whole numbers of a pair: its bodies, and where its numbers stand, which it shares with equal pairs."""
 
     first: wp.int32
     second: wp.int32
@@ -99,12 +99,12 @@ class Scene:
         runs: Balls around each block and those after it, `RUN` in all.
         solids: What samples press on.
         n_pressing: Pairs with samples that press.
-        pairs: Of pairs that are not alike, shape (worlds, kinds of pairs).
+        pairs: Of pairs that differ, shape (worlds, kinds of pairs).
         pair_index: Shape (pairs + contacts with a patch law,): of each pair with samples that press, then of
             each contact with a patch law.
         partners: Of each body and each other the pair in which the first one's samples press on the other, −1
             for none, shape (n · n,); no rows where all pairs are asked in each step.
-        materials: Of contacts with point laws that are not alike, shape (worlds, kinds of contacts).
+        materials: Of contacts with point laws that differ, shape (worlds, kinds of contacts).
         gravity: [m/s²], shape (worlds, 1).
         timestep: h [s], shape (worlds, 1).
         patches: Contacts with a patch law.
@@ -344,7 +344,7 @@ class Room:
         islands: First of the blocks with which a block is coupled, by others, too: see `linear_solve`.
         members: Blocks of unknowns, island by island.
         sorted_pairs: Pairs with points, island by island.
-        parts: Where islands begin and end, by the first of their blocks.
+        of_islands: Where islands begin and end, by the first of their blocks.
         rests: Whether bodies that move rest at the end of a step.
         asleep: Number of the island that each of them sleeps with, −1 where it is awake.
         sizes: Of the velocities that each body's momentum stands for [m/s].
@@ -409,7 +409,7 @@ class Room:
     islands: wp.array2d(dtype=wp.int32)
     members: wp.array2d(dtype=wp.int32)
     sorted_pairs: wp.array2d(dtype=wp.int32)
-    parts: wp.array2d(dtype=Island)
+    of_islands: wp.array2d(dtype=Island)
     rests: wp.array2d(dtype=wp.int32)
     asleep: wp.array2d(dtype=wp.int32)
     sizes: wp.array2d(dtype=real)

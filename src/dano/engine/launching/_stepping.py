@@ -173,7 +173,9 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
         **dict.fromkeys(("bodies", "partners", "sizes"), n),
         **dict.fromkeys(("momentum", "inertia", "meetings"), m),
         **dict.fromkeys(("velocity", "old", "tried", "best", "moved", "step", "residual", "scale"), blocks),
-        **dict.fromkeys(("order", "counts", "degrees", "neighbours", "islands", "members", "parts"), blocks),
+        **dict.fromkeys(
+            ("order", "counts", "degrees", "neighbours", "islands", "members", "of_islands"), blocks
+        ),
         **dict.fromkeys(("begins", "ends", "rests", "asleep"), blocks),
         **dict.fromkeys(("used", "later", "beside", "listed"), blocks * blocks),
         **dict.fromkeys(("blocks", "spare"), blocks * blocks + 1),
