@@ -330,6 +330,44 @@ def pull_support(
     return whole
 
 
+@wp.func
+def touching_of(scene: wp.ref[Scene], world: int, found: FoundPair) -> Touching:
+    """What the samples of a pair depend on, without its pose, and with all of the restitution."""
+    pair = numbers_of(scene, world, found.pair)
+    at = Touching()
+    at.share = found.share
+    at.timestep = scene.timestep[world, 0]
+    at.stiffness_share = pair.share
+    at.depth = pair.impact_depth
+    at.rests = left_out(found, pair.factor)
+    at.material = scene.materials[world, scene.pair_index[found.pair].contact]
+    at.impact = found.impact
+    return at
+
+
+@wp.func
+def add_to_depths(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair, by: Touching, bar: real
+) -> real:
+    """Add derivatives by a pair's depths; returns the one by the depth beside what it rests on.
+
+    `bar` is that by the depth at which the bodies meet, whichever that is.
+    """
+    pair = numbers_of(scene, world, found.pair)
+    row = scene.pair_index[found.pair].row
+    beside = real(0.0)
+    room.bars.pairs[world, row].share += by.stiffness_share
+    room.bars.pairs[world, row].impact_depth += by.depth + by.impact.depth
+    room.bars.pairs[world, row].deepest += by.impact.deepest
+    if found.hits > 0 and wp.length_sq(found.support) > ZERO:
+        beside = bar
+    elif found.hits > 0 or pair.impact_depth > pair.sink:
+        room.bars.pairs[world, row].impact_depth += bar
+    else:
+        room.bars.pairs[world, row].sink += bar
+    return beside
+
+
 @after_adjoints
 @wp.func
 def pull_pair(
@@ -354,16 +392,9 @@ def pull_pair(
     h = scene.timestep[world, 0]
     a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
     at = met_pair(scene, world, found, a, b, found.share, found.toward)
-    samples = Touching()
+    samples = touching_of(scene, world, found)
     samples.pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
     samples.pose.com_difference = found.com_difference
-    samples.share = found.share
-    samples.timestep = h
-    samples.stiffness_share = pair.share
-    samples.depth = pair.impact_depth
-    samples.rests = left_out(found, pair.factor)
-    samples.material = scene.materials[world, index.contact]
-    samples.impact = found.impact
     restores = ONE
     if samples.material.instant > ZERO:
         restores = rebound
@@ -414,17 +445,8 @@ def pull_pair(
         of_pose, depth_bar = pull_pose(scene, room, world, lane, found, at, samples.pose, by)
         add_to_met(bar, of_pose)
         add_to_material(room.bars.materials, world, index.contact, by.material)
-        room.bars.pairs[world, index.row].share += by.stiffness_share
-        room.bars.pairs[world, index.row].impact_depth += by.depth + by.impact.depth
         room.bars.pairs[world, index.row].factor += factor_bar
-        room.bars.pairs[world, index.row].deepest += by.impact.deepest
-        rests = found.hits > 0 and wp.length_sq(found.support) > ZERO
-        if not rests and (found.hits > 0 or pair.impact_depth > pair.sink):
-            room.bars.pairs[world, index.row].impact_depth += depth_bar
-        elif not rests:
-            room.bars.pairs[world, index.row].sink += depth_bar
-        if not rests:
-            depth_bar = ZERO
+        depth_bar = add_to_depths(scene, room, world, found, by, depth_bar)
     else:
         bar = MetPair()
     if wp.static(not TREES):
