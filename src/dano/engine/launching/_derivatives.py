@@ -205,7 +205,7 @@ def _of_steps(forward: Plan, fields: dict[str, str], row: Any, lead: tuple[int, 
     }
 
 
-_ENDS = dict(zip(_STATE, CHANGED, strict=True))
+_ENDS: dict[str, str] = dict(zip(_STATE, CHANGED, strict=True))
 
 
 def _working(forward: Plan) -> tuple[dict[str, Shape], dict[str, View]]:
@@ -353,12 +353,6 @@ def _spread(change, axis, size: int):
     if axis is not None:
         return jnp.moveaxis(change, axis, 1)
     return jnp.broadcast_to(change[:, None], (change.shape[0], size, *change.shape[1:]))
-
-
-def _rows(plan: Plan, inputs: Any, batched: Any) -> dict[str, Any]:
-    """Inputs of a rollout by place, with an axis of worlds, of which there is one where all are alike."""
-    rows = zip(plan.inputs, inputs, batched, strict=False)
-    return {place: x if differs else x[None] for place, x, differs in rows}
 
 
 def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) -> Plan:

@@ -57,7 +57,7 @@ class Whole:
         found = hashlib.sha256()
         for name, values in self.arrays.items():
             found.update(repr((name, values.shape, values.dtype.str)).encode())
-            found.update(np.ascontiguousarray(values))
+            found.update(values.tobytes())
         return found.hexdigest()
 
     @functools.cached_property

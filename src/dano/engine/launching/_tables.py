@@ -167,7 +167,7 @@ def scene_tables(scene: Scene) -> Tables:
     whole = {
         "scene.body_index": np.array(index, np.int32),
         "scene.moving": structure.moving,
-        "scene.pair_index": np.concatenate([known.index, patches.pair_index]),
+        "scene.pair_index": np.concatenate([known.indices, patches.pair_index]),
         "scene.solids.kinds": of_leaves.kinds,
     }
     if len(pairs) > SWEPT:
@@ -300,7 +300,7 @@ _NONE = np.zeros((0, 2), int)
 class _KnownOfPairs(NamedTuple):
     """What kernels know of pairs whose first body's samples press on the second's solid."""
 
-    index: Int[np.ndarray, "k 5"]  # See `dano.engine.kernels.tables.PairIndex`
+    indices: Int[np.ndarray, "k 5"]  # See `dano.engine.kernels.tables.PairIndex`
     pairs: Float[AnyArray, "kinds 7"]
     materials: Float[AnyArray, "materials width"]
 
