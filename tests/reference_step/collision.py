@@ -58,7 +58,6 @@ class Points(NamedTuple):
         part: Share of an impact that the side carries.
         left_out: Share of a sample that rests which has no part in an impact.
         waits: Whether impulses on the first and on the second body take effect when the bodies meet.
-        nears: Speed at which the samples that have sunk in, or nearly have, near the other body [m/s].
         seen: The bodies with what their velocities gain until then.
     """
 
@@ -90,7 +89,6 @@ class Points(NamedTuple):
     part: float
     left_out: float
     waits: tuple[bool, bool] = (False, False)
-    nears: float = 0.0
     seen: Bodies | None = None
 
 
@@ -482,7 +480,7 @@ def find(scene, bodies, shares=None):
         given = shares.get((side.i, side.j))
         met = hitting if listed(scene, bodies, side, hitting).beta > 0 else lasting
         found.append(listed(scene, bodies, side, met if given is None else met._replace(share=given)))
-    return together(bodies, halved([points for points in found if len(points.area)], bodies.h))
+    return together(bodies, halved([points for points in found if len(points.area)], bodies))
 
 
 def rounded(pair, normal):
@@ -543,7 +541,7 @@ def listed(scene, bodies, side, met):
     counts = 1 - (1 - smooth_step(-approach / side.law.slowest_rebound - 1)) * left_out
     weight = fading_in(x) * hit * counts
     near_load = area * usual * fading_in(1 + before / delta) * counts
-    beta, stiffness, approaches = 0.0, 0.0, near_load @ approach
+    beta, stiffness = 0.0, 0.0
     if not met.lasts:
         beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
     delays, turns = beta * (met.hits and not scene.joints), (np.zeros((3, 3)), np.zeros(3))
@@ -578,7 +576,6 @@ def listed(scene, bodies, side, met):
         way=(1 - delays) * max(share, 0) * met.hits,
         part=1.0,
         left_out=left_out,
-        nears=-approaches / max(near_load.sum(), 1e-300),
         seen=bodies,
     )
 
@@ -638,25 +635,22 @@ def impact(bodies, side, arm, normal, load, near_load, approach):
     return beta, factor / (bodies.h * mobility * load.sum())
 
 
-def halved(found, h):
+def halved(found, bodies):
     """Sides whose impacts both bodies' samples have part in, with half of it each.
 
-    Where one side meets before the other has sunk in, it is its impact alone.
+    If both bodies move, their impulses act from the start of the step.
     """
-    hits = {points[:2]: points for points in found if np.any(points.impact > 0)}
+    hits = {(points.first, points.second) for points in found if np.any(points.impact > 0)}
 
-    def shared(points):
-        other = hits.get((points.second, points.first))
-        if points[:2] not in hits or other is None:
+    def half(points):
+        if points[:2] not in hits or (points.second, points.first) not in hits:
             return points
-        later = max(points, other, key=lambda p: p.share)
-        if later.nears * h * abs(points.share - other.share) <= later.delta:
-            return points._replace(impact=points.impact / 2, kappa=points.kappa / 2, part=0.5)
-        if later is other:
-            return points
-        return points._replace(impact=0 * points.impact, kappa=0.0, beta=0.0, delays=0.0, way=0.0, after=0.0)
+        points = points._replace(impact=points.impact / 2, kappa=points.kappa / 2, part=0.5)
+        if all(bodies.moves[list(points[:2])]):
+            return points._replace(delays=0.0, way=max(points.share, 0.0))
+        return points
 
-    return [shared(points) for points in found]
+    return [half(points) for points in found]
 
 
 def together(bodies, found):

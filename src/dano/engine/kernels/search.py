@@ -314,8 +314,7 @@ def find_rest(
 def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Halve impacts that samples of both bodies have part in.
 
-    Where those of one body meet when the others have not yet sunk in, it is their impact alone: they keep the
-    others from it.
+    If both bodies move, they do not wait: with two moments, angular momentum would not be conserved.
     """
     h = scene.timestep[world, 0]
     for f in range(1, n_found):
@@ -328,17 +327,13 @@ def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
                 room.found[world, one].impact.stiffness > ZERO
                 and room.found[world, other].impact.stiffness > ZERO
             ):
-                later = wp.where(room.found[world, one].share > room.found[world, other].share, one, other)
-                waits = h * wp.abs(room.found[world, one].share - room.found[world, other].share)
-                found = room.found[world, later]
-                impact = found.impact
-                if -waits * found.patch.near_rate > impact.depth * found.patch.near_load:
-                    room.found[world, later].impact = no_impact(
-                        impact.depth, impact.factor, impact.deepest, h
-                    )
-                else:
-                    room.found[world, one].impact.part = HALF
-                    room.found[world, other].impact.part = HALF
+                room.found[world, one].impact.part = HALF
+                room.found[world, other].impact.part = HALF
+                if scene.body_index[mine.first].row >= 0 and scene.body_index[mine.second].row >= 0:
+                    for side in range(2):
+                        k = one - side * _LANES
+                        found = room.found[world, k]
+                        room.found[world, k].impact = delayed(found.impact, ZERO, found.share, h)
 
 
 @wp.func
