@@ -250,12 +250,12 @@ def meetings(scene, bodies, side):
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
-    raw, bodies = bodies, bodies.falling(held_of(scene, bodies, side))
-    since = 0.0 if scene.joints else -1.0
+    raw, bodies = bodies, bodies.falling()
+    since = -1.0 if is_alone(scene, bodies, side) else 0.0
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
     falls = nears(scene, bodies, side, delta, slow)
     support, left_out = np.zeros(6), 0.0
-    if is_alone(scene, bodies, side) and share < 1 and falls:
+    if since and share < 1 and falls:
         rest = rest_of(scene, raw, side, delta)
         if rest is not None:
             near, depth, arm, normal = rest
@@ -372,14 +372,6 @@ def is_alone(scene, bodies, side):
     return not scene.joints and not (bodies.moves[side.i] and bodies.moves[side.j])
 
 
-def held_of(scene, bodies, side):
-    """Which bodies others hold, shape (n,): of two that move those that hardly do."""
-    held = np.zeros(len(bodies.mass), bool)
-    if not scene.joints and not is_alone(scene, bodies, side):
-        held[[side.i, side.j]] = bodies.slow()[[side.i, side.j]]
-    return held
-
-
 def nears(scene, bodies, side, limit, slow):
     """Whether a sample that may get as deep as a limit [m] goes in faster than `slow` [m/s]."""
     if nearing(scene, bodies, side) <= slow:
@@ -480,7 +472,7 @@ def find(scene, bodies, shares=None):
         given = shares.get((side.i, side.j))
         met = hitting if listed(scene, bodies, side, hitting).beta > 0 else lasting
         found.append(listed(scene, bodies, side, met if given is None else met._replace(share=given)))
-    return together(bodies, halved([points for points in found if len(points.area)], bodies))
+    return together(bodies, halved([points for points in found if len(points.area)]))
 
 
 def rounded(pair, normal):
@@ -501,7 +493,7 @@ def unit_rows(vectors):
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
     start = bodies
-    bodies = bodies.falling(held_of(scene, bodies, side)) if met.falls else bodies.held()
+    bodies = bodies.falling() if met.falls else bodies.held()
     if met.falls:
         bodies = bodies.supported(on_bodies(bodies, side.i, side.j, met.support))
     i, j, h, share = side.i, side.j, bodies.h, met.share
@@ -544,8 +536,9 @@ def listed(scene, bodies, side, met):
     beta, stiffness = 0.0, 0.0
     if not met.lasts:
         beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
-    delays, turns = beta * (met.hits and not scene.joints), (np.zeros((3, 3)), np.zeros(3))
-    if delays > 0 and is_alone(scene, bodies, side):
+    alone = is_alone(scene, bodies, side) and met.hits
+    delays, turns = beta * alone, (np.zeros((3, 3)), np.zeros(3))
+    if delays > 0:
         load = area * weight / (area * weight).sum()
         turns = turns_after(scene, bodies, side, share, load @ arm, load @ normal)
     return Points(
@@ -635,22 +628,15 @@ def impact(bodies, side, arm, normal, load, near_load, approach):
     return beta, factor / (bodies.h * mobility * load.sum())
 
 
-def halved(found, bodies):
-    """Sides whose impacts both bodies' samples have part in, with half of it each.
-
-    If both bodies move, their impulses act from the start of the step.
-    """
+def halved(found):
+    """Sides whose impacts both bodies' samples have part in, with half of it each."""
     hits = {(points.first, points.second) for points in found if np.any(points.impact > 0)}
-
-    def half(points):
-        if points[:2] not in hits or (points.second, points.first) not in hits:
-            return points
-        points = points._replace(impact=points.impact / 2, kappa=points.kappa / 2, part=0.5)
-        if all(bodies.moves[list(points[:2])]):
-            return points._replace(delays=0.0, way=max(points.share, 0.0))
-        return points
-
-    return [half(points) for points in found]
+    return [
+        points._replace(impact=points.impact / 2, kappa=points.kappa / 2, part=0.5)
+        if (points.second, points.first) in hits
+        else points
+        for points in found
+    ]
 
 
 def together(bodies, found):

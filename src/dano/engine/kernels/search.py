@@ -54,7 +54,6 @@ from dano.physics.pairs import (
     BodyState,
     centres_apart,
     falling,
-    is_held,
     PairPose,
     speed_within,
 )
@@ -250,7 +249,8 @@ def impact_of(
         found: What is found of the pair.
         pair: The pair.
         turning: How samples turn with the first body.
-        alone: Whether one of the bodies is fixed.
+        alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
+            they meet; between two that move, this would not conserve angular momentum.
     """
     impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, material.timestep)
     if patch.load > ZERO:
@@ -259,9 +259,7 @@ def impact_of(
             impact.stiffness = stiffness_of_impact(
                 a, b, patch, material.bounce, pair.factor, material.timestep
             )
-            delays = real(0.0)
-            if wp.static(not TREES):
-                delays = impact.share
+            delays = wp.where(alone, impact.share, ZERO)
             impact = delayed(impact, delays, found.share, material.timestep)
             impact.rests = left_out(found, pair.factor)
             if alone:
@@ -312,11 +310,7 @@ def find_rest(
 
 @wp.func
 def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Halve impacts that samples of both bodies have part in.
-
-    If both bodies move, they do not wait: with two moments, angular momentum would not be conserved.
-    """
-    h = scene.timestep[world, 0]
+    """Halve impacts that samples of both bodies have part in."""
     for f in range(1, n_found):
         one = f * _LANES + lane
         other = one - _LANES
@@ -329,11 +323,6 @@ def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
             ):
                 room.found[world, one].impact.part = HALF
                 room.found[world, other].impact.part = HALF
-                if scene.body_index[mine.first].row >= 0 and scene.body_index[mine.second].row >= 0:
-                    for side in range(2):
-                        k = one - side * _LANES
-                        found = room.found[world, k]
-                        room.found[world, k].impact = delayed(found.impact, ZERO, found.share, h)
 
 
 @wp.func
@@ -415,16 +404,9 @@ def find_pair(
     b = room.bodies[world, index.second]
     material = scene.materials[world, index.contact]
     alone = bool(False)
-    # Others hold what hardly moves.
-    first_falls = int(1)
-    second_falls = int(1)
-    since = real(0.0)
     if wp.static(not TREES):
         alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
-        since = -ONE
-        if not alone:
-            first_falls = wp.where(is_held(a), 0, 1)
-            second_falls = wp.where(is_held(b), 0, 1)
+    since = wp.where(alone, -ONE, ZERO)
     found = FoundPair()
     found.pair = p
     found.first = at
@@ -437,7 +419,7 @@ def find_pair(
     met = Meeting()
     if not lasts:
         met = meeting(
-            scene, room, world, lane, falling(a, first_falls), falling(b, second_falls), pair, index.first,
+            scene, room, world, lane, falling(a, 1), falling(b, 1), pair, index.first,
             index.second, h, pair.impact_depth, slow, slow, since,
         )  # fmt: skip
         # What moves so slowly has no impact.
@@ -449,8 +431,7 @@ def find_pair(
             # What it rests on goes on to press until it meets, and says when that is.
             found.rest = find_rest(scene, room, world, lane, a, b, p)
             if found.rest.load > ZERO:
-                found.first_falls = 1
-                found.second_falls = 1
+                found.falls = 1
                 seen = falling(a, 1)
                 other = falling(b, 1)
                 found.support = support_of(seen, other, found.rest, material.friction, h, turning)
@@ -464,9 +445,8 @@ def find_pair(
     while again:
         again = False
         found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
-        found.first_falls = wp.where(not lasts and met.nears, first_falls, 0)
-        found.second_falls = wp.where(not lasts and met.nears, second_falls, 0)
-        if lasts or not met.nears:
+        found.falls = wp.where(not lasts and met.nears, 1, 0)
+        if found.falls == 0:
             found.support = vec6()
         found.critical = met.critical
         found.share = met.share
@@ -500,7 +480,7 @@ def find_pair(
                 met = lasting_meeting(
                     scene, room, world, lane, a, b, pair, index.first, index.second, h, sink
                 )
-            again = met.share != before or found.first_falls + found.second_falls > 0
+            again = met.share != before or found.falls > 0
     seen, other = as_they_meet(a, b, found, h)
     found.toward = facing(scene, world, seen, other, index.first, index.second, found.share, h)
     found.end = wp.min(after, end)
