@@ -112,7 +112,9 @@ def test_a_throw_is_found_from_far_away_starts():
             fits.append(dano.identify(thrown(*guess), motion, parameters, initial="states", noise=noise))
     for fit in fits:
         for name in ("friction", "restitution"):
-            assert abs(fit.values[name] - 0.3) < max(4 * fit.standard_errors[name], 0.01)
+            # Ripples add about as much as the noise, of which alone a standard error knows.
+            error = np.sqrt(2) * fit.standard_errors[name]
+            assert abs(fit.values[name] - 0.3) < max(4 * error, 0.01)
             assert fit.standard_errors[name] < 0.1
             apart = abs(fit.values[name] - fits[0].values[name])
             assert apart < 3 * fit.standard_errors[name] + 0.01
