@@ -274,7 +274,7 @@ def _transposed(cotangents, *inputs, plan, batched, n_worlds, which, differs, n_
     for place, output in back.gradients.items():
         # Worlds that share coefficients would add to the same derivatives at the same time.
         at = list(plan.inputs).index(place)
-        if f"{output}" in back.outputs and not batched[at] and n_worlds > 1:
+        if output in back.outputs and not batched[at] and n_worlds > 1:
             residuals[at] = jnp.broadcast_to(residuals[at][None], (n_worlds, *residuals[at].shape))
             batched[at] = True
 
