@@ -49,6 +49,7 @@ class Points(NamedTuple):
         drift: ½ ω⁻ × (r₁ − r₀), its tangential part limited [m/s], shape (n, 3).
         impact: κ w [Pa s/m], zero where there is no impact, shape (n,).
         kappa: κ [Pa s/m].
+        nearing: How fast samples that have sunk in or nearly have approach, in the mean [m/s].
         sunk: Depth where geometry is taken [m], shape (n,).
         delta: Depth of the impact [m].
         deepest: Depth that another part of the body may have, whose impact is left to the next step [m].
@@ -80,6 +81,7 @@ class Points(NamedTuple):
     drift: np.ndarray
     impact: np.ndarray
     kappa: float
+    nearing: float
     sunk: np.ndarray
     delta: float
     deepest: float
@@ -250,12 +252,12 @@ def meetings(scene, bodies, side):
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
-    raw, bodies = bodies, bodies.falling()
-    since = -1.0 if is_alone(scene, bodies, side) else 0.0
+    raw, bodies = bodies, bodies.falling(held_of(scene, bodies, side))
+    since = 0.0 if scene.joints else -1.0
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
     falls = nears(scene, bodies, side, delta, slow)
     support, left_out = np.zeros(6), 0.0
-    if since and share < 1 and falls:
+    if is_alone(scene, bodies, side) and share < 1 and falls:
         rest = rest_of(scene, raw, side, delta)
         if rest is not None:
             near, depth, arm, normal = rest
@@ -372,6 +374,14 @@ def is_alone(scene, bodies, side):
     return not scene.joints and not (bodies.moves[side.i] and bodies.moves[side.j])
 
 
+def held_of(scene, bodies, side):
+    """Which bodies others hold, shape (n,): of two that move those that hardly do."""
+    held = np.zeros(len(bodies.mass), bool)
+    if not scene.joints and not is_alone(scene, bodies, side):
+        held[[side.i, side.j]] = bodies.slow()[[side.i, side.j]]
+    return held
+
+
 def nears(scene, bodies, side, limit, slow):
     """Whether a sample that may get as deep as a limit [m] goes in faster than `slow` [m/s]."""
     if nearing(scene, bodies, side) <= slow:
@@ -472,7 +482,7 @@ def find(scene, bodies, shares=None):
         given = shares.get((side.i, side.j))
         met = hitting if listed(scene, bodies, side, hitting).beta > 0 else lasting
         found.append(listed(scene, bodies, side, met if given is None else met._replace(share=given)))
-    return together(bodies, halved([points for points in found if len(points.area)]))
+    return together(bodies, halved([points for points in found if len(points.area)], bodies))
 
 
 def rounded(pair, normal):
@@ -490,10 +500,13 @@ def unit_rows(vectors):
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+OF_POINTS = ("arm", "normal", "moment", "depth", "rate", "meets", "area", "drift", "impact", "sunk")
+
+
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
     start = bodies
-    bodies = bodies.falling() if met.falls else bodies.held()
+    bodies = bodies.falling(held_of(scene, bodies, side)) if met.falls else bodies.held()
     if met.falls:
         bodies = bodies.supported(on_bodies(bodies, side.i, side.j, met.support))
     i, j, h, share = side.i, side.j, bodies.h, met.share
@@ -536,9 +549,8 @@ def listed(scene, bodies, side, met):
     beta, stiffness = 0.0, 0.0
     if not met.lasts:
         beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
-    alone = is_alone(scene, bodies, side) and met.hits
-    delays, turns = beta * alone, (np.zeros((3, 3)), np.zeros(3))
-    if delays > 0:
+    delays, turns = beta * (met.hits and not scene.joints), (np.zeros((3, 3)), np.zeros(3))
+    if delays > 0 and is_alone(scene, bodies, side):
         load = area * weight / (area * weight).sum()
         turns = turns_after(scene, bodies, side, share, load @ arm, load @ normal)
     return Points(
@@ -561,6 +573,7 @@ def listed(scene, bodies, side, met):
         drift=drift[kept],
         impact=(stiffness * met.hits * weight)[kept],
         kappa=stiffness * met.hits,
+        nearing=-float(near_load @ approach) / max(near_load.sum(), 1e-300),
         sunk=np.where(other, 0, before)[kept],
         delta=delta,
         deepest=deepest,
@@ -628,15 +641,50 @@ def impact(bodies, side, arm, normal, load, near_load, approach):
     return beta, factor / (bodies.h * mobility * load.sum())
 
 
-def halved(found):
-    """Sides whose impacts both bodies' samples have part in, with half of it each."""
-    hits = {(points.first, points.second) for points in found if np.any(points.impact > 0)}
+def halved(found, bodies):
+    """Sides of pairs as they take part in one impact, with half of it each if both do."""
+    by_pair = {points[:2]: points for points in found}
+    agreed = {}
+    for pair, points in by_pair.items():
+        other = by_pair.get(pair[::-1])
+        if other is not None and all(bodies.moves[list(pair)]):
+            agreed[pair] = at_one_moment(points, other, bodies)
+    found = [agreed.get(points[:2], points) for points in found]
+    hits = {points[:2] for points in found if np.any(points.impact > 0)}
     return [
         points._replace(impact=points.impact / 2, kappa=points.kappa / 2, part=0.5)
-        if (points.second, points.first) in hits
+        if points[:2] in hits and points[1::-1] in hits
         else points
         for points in found
     ]
+
+
+def at_one_moment(side, other, bodies):
+    """A side of a pair that moves, with impulses that take effect when those of the other one do.
+
+    The side that meets first says when. The other takes part if it has met by then, too, but for δ, or else
+    in the next step, unless the bodies rest on it: then impulses act from the start of the step.
+    """
+    both = side.kappa > 0 and other.kappa > 0
+    if side.kappa == other.kappa == 0:
+        return side
+    if both:
+        earlier, later = sorted((side, other), key=lambda points: (points.share, points[:2]))
+    else:
+        earlier, later = (side, other) if side.kappa > 0 else (other, side)
+    until = max(earlier.delays * earlier.share, 0)
+    if both and (later.share - earlier.share) * bodies.h * later.nearing <= later.delta:
+        delays = until / side.share if until else 0.0
+    elif not np.any(later.depth > 0):
+        if side is later:
+            none = {name: getattr(side, name)[:0] for name in OF_POINTS}
+            return side._replace(kappa=0.0, delays=0.0, **none)
+        return side
+    elif side.kappa == 0:
+        return side
+    else:
+        delays = 0.0
+    return side._replace(delays=delays, way=(1 - delays) * max(side.share, 0.0))
 
 
 def together(bodies, found):

@@ -218,13 +218,19 @@ class Kinematics:
         R = self.rotation_met(i)
         return R @ self.bodies.inertia[i] @ R.T
 
-    def end_of_impact(self, i, w):
-        """Spin at the end of the step [B] and what it turns by besides `w` [W]; w is that of the balance."""
+    def turn_in_impact(self, i, w):
+        """What a body turns by in the step besides the spin of the balance w [rad/s, W]."""
         R, J, h, met = self.rotation_met(i), self.bodies.inertia[i], self.h, self.met[i]
         seen = R.T @ w
-        omega = spin_with(momentum(seen, J, h, self.lead[i]), seen, J, h, 1 - 2 * met)
-        gains = R @ gyroscopic_gain(omega, J, h) - self.bodies.spin_gain[i]
-        return omega, R @ (omega - seen) + met**2 / 2 * gains
+        after = spin_with(momentum(seen, J, h, self.lead[i]), seen, J, h, 1 - 2 * met)
+        gains = R @ gyroscopic_gain(after, J, h) - self.bodies.spin_gain[i]
+        return R @ (after - seen) + met**2 / 2 * gains
+
+    def spin_after_impact(self, i, w, orientation):
+        """Spin at the end of the step [B], of a body whose balance gives w [rad/s, W]."""
+        R, J, h = self.rotation_met(i), self.bodies.inertia[i], self.h
+        L = R @ momentum(R.T @ w, J, h, self.lead[i])
+        return spin_with(matrix(orientation).T @ L, R.T @ w, J, h, -1)
 
     def gaps(self, y):
         """φ: how far loops are open after a step; distances [m, W], then turns of welds [rad]."""
@@ -255,9 +261,11 @@ class Kinematics:
         omega = [matrix(q).T @ V[3:] for (_, q), V in zip(self.now, twists, strict=True)]
         for r, i in enumerate(self.free):
             if self.lead[i] < 1:
-                omega[i], turned = self.end_of_impact(i, twists[i][3:])
-                moved[6 * r + 3 : 6 * r + 6] += turned
+                moved[6 * r + 3 : 6 * r + 6] += self.turn_in_impact(i, twists[i][3:])
         poses = self.placed(moved)
+        for i in self.free:
+            if self.lead[i] < 1:
+                omega[i] = self.spin_after_impact(i, twists[i][3:], poses[i][1])
         q = (self.q + self.h * y)[rows]
         for joint in self.joints:
             if joint.kind == "ball":

@@ -364,18 +364,18 @@ def advance_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, r
         state = room.bodies[world, i]
         moved = room.moved[world, m]
         back = wp.transpose(matrix(state.orientation))
-        turn = angular_part(moved)
         after.velocity = linear_part(v)
         after.omega = back * angular_part(v)
+        after.position = row.position + h * linear_part(moved)
+        orientation = turned(state.orientation, back * angular_part(moved), h)
         if state.lead < ONE:
             end = end_of_impact(
-                angular_part(v), scene.bodies[world, i].inertia, rotation_met(state), state.spin_gain, h,
-                state.met, state.lead,
+                angular_part(v), scene.bodies[world, i].inertia, rotation_met(state), state.orientation,
+                angular_part(moved), state.spin_gain, h, state.met, state.lead,
             )  # fmt: skip
             after.omega = end.omega
-            turn = turn + end.turn
-        after.position = row.position + h * linear_part(moved)
-        after.orientation = to_wxyz(turned(state.orientation, back * turn, h))
+            orientation = end.orientation
+        after.orientation = to_wxyz(orientation)
     return after
 
 

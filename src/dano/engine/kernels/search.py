@@ -54,6 +54,7 @@ from dano.physics.pairs import (
     BodyState,
     centres_apart,
     falling,
+    is_held,
     PairPose,
     speed_within,
 )
@@ -249,8 +250,7 @@ def impact_of(
         found: What is found of the pair.
         pair: The pair.
         turning: How samples turn with the first body.
-        alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
-            they meet; between two that move, this would not conserve angular momentum.
+        alone: Whether one of the bodies is fixed.
     """
     impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, material.timestep)
     if patch.load > ZERO:
@@ -259,7 +259,9 @@ def impact_of(
             impact.stiffness = stiffness_of_impact(
                 a, b, patch, material.bounce, pair.factor, material.timestep
             )
-            delays = wp.where(alone, impact.share, ZERO)
+            delays = real(0.0)
+            if wp.static(not TREES):
+                delays = impact.share
             impact = delayed(impact, delays, found.share, material.timestep)
             impact.rests = left_out(found, pair.factor)
             if alone:
@@ -309,14 +311,78 @@ def find_rest(
 
 
 @wp.func
+def touches(room: wp.ref[Room], world: int, found: FoundPair) -> bool:
+    """Whether a pair touches when the step begins."""
+    deepest = real(0.0)
+    for k in range(found.first, found.end):
+        deepest = wp.max(deepest, room.points[world, k].depth)
+    return total(deepest) > ZERO
+
+
+@wp.func
+def leave_to_next(room: wp.ref[Room], world: int, k: int):
+    """Leave a side of a pair to the next step."""
+    found = room.found[world, k]
+    found.end = found.first
+    found.impact = no_impact(found.impact.depth, found.impact.factor, found.impact.deepest, found.impact.rest)
+    room.found[world, k] = found
+
+
+@wp.func
+def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h: real):
+    """Have impulses of both sides of a pair take effect at one moment: else its momentum would change.
+
+    The side that meets first says when. The other one takes part if it has met by then, too, but for δ. Else
+    it is left to the next step, unless the bodies rest on it: then impulses act from the start of the step.
+
+    Args:
+        room: Where the sides stand.
+        world: The world.
+        earlier: The side that has an impact, of both the one that meets first.
+        later: The other one.
+        h: Timestep [s].
+    """
+    ahead = room.found[world, earlier]
+    behind = room.found[world, later]
+    way = ZERO
+    if behind.impact.stiffness > ZERO:
+        way = (behind.share - ahead.share) * h * -behind.patch.near_rate / behind.patch.near_load
+    if behind.impact.stiffness == ZERO or way > behind.impact.depth:
+        if touches(room, world, behind):
+            room.found[world, earlier].impact = delayed(ahead.impact, ZERO, ahead.share, h)
+            if behind.impact.stiffness > ZERO:
+                room.found[world, later].impact = delayed(behind.impact, ZERO, behind.share, h)
+        else:
+            leave_to_next(room, world, later)
+    else:
+        until = ahead.impact.delays * ahead.share
+        delays = ZERO
+        if until > ZERO:
+            delays = until / behind.share
+        else:
+            room.found[world, earlier].impact = delayed(ahead.impact, ZERO, ahead.share, h)
+        room.found[world, later].impact = delayed(behind.impact, delays, behind.share, h)
+
+
+@wp.func
 def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Halve impacts that samples of both bodies have part in."""
+    """Have both sides of a pair take part in one impact: samples of the first body, and of the second."""
+    h = scene.timestep[world, 0]
     for f in range(1, n_found):
-        one = f * _LANES + lane
-        other = one - _LANES
+        one = (f - 1) * _LANES + lane
+        other = f * _LANES + lane
         mine = scene.pair_index[room.found[world, one].pair]
         theirs = scene.pair_index[room.found[world, other].pair]
         if mine.first == theirs.second and mine.second == theirs.first:
+            first = room.found[world, one]
+            second = room.found[world, other]
+            hits = first.impact.stiffness > ZERO
+            if wp.static(not TREES):
+                if scene.body_index[mine.first].row >= 0 and scene.body_index[mine.second].row >= 0:
+                    if hits and (second.impact.stiffness == ZERO or first.share <= second.share):
+                        agree_on_moment(room, world, one, other, h)
+                    elif second.impact.stiffness > ZERO:
+                        agree_on_moment(room, world, other, one, h)
             if (
                 room.found[world, one].impact.stiffness > ZERO
                 and room.found[world, other].impact.stiffness > ZERO
@@ -404,9 +470,16 @@ def find_pair(
     b = room.bodies[world, index.second]
     material = scene.materials[world, index.contact]
     alone = bool(False)
+    # Others hold what hardly moves.
+    first_falls = int(1)
+    second_falls = int(1)
+    since = real(0.0)
     if wp.static(not TREES):
         alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
-    since = wp.where(alone, -ONE, ZERO)
+        since = -ONE
+        if not alone:
+            first_falls = wp.where(is_held(a), 0, 1)
+            second_falls = wp.where(is_held(b), 0, 1)
     found = FoundPair()
     found.pair = p
     found.first = at
@@ -419,7 +492,7 @@ def find_pair(
     met = Meeting()
     if not lasts:
         met = meeting(
-            scene, room, world, lane, falling(a, 1), falling(b, 1), pair, index.first,
+            scene, room, world, lane, falling(a, first_falls), falling(b, second_falls), pair, index.first,
             index.second, h, pair.impact_depth, slow, slow, since,
         )  # fmt: skip
         # What moves so slowly has no impact.
@@ -431,7 +504,8 @@ def find_pair(
             # What it rests on goes on to press until it meets, and says when that is.
             found.rest = find_rest(scene, room, world, lane, a, b, p)
             if found.rest.load > ZERO:
-                found.falls = 1
+                found.first_falls = 1
+                found.second_falls = 1
                 seen = falling(a, 1)
                 other = falling(b, 1)
                 found.support = support_of(seen, other, found.rest, material.friction, h, turning)
@@ -445,8 +519,9 @@ def find_pair(
     while again:
         again = False
         found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
-        found.falls = wp.where(not lasts and met.nears, 1, 0)
-        if found.falls == 0:
+        found.first_falls = wp.where(not lasts and met.nears, first_falls, 0)
+        found.second_falls = wp.where(not lasts and met.nears, second_falls, 0)
+        if lasts or not met.nears:
             found.support = vec6()
         found.critical = met.critical
         found.share = met.share
@@ -480,7 +555,7 @@ def find_pair(
                 met = lasting_meeting(
                     scene, room, world, lane, a, b, pair, index.first, index.second, h, sink
                 )
-            again = met.share != before or found.falls > 0
+            again = met.share != before or found.first_falls + found.second_falls > 0
     seen, other = as_they_meet(a, b, found, h)
     found.toward = facing(scene, world, seen, other, index.first, index.second, found.share, h)
     found.end = wp.min(after, end)

@@ -12,9 +12,10 @@ from dano.engine.kernels.search import fix_laws
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import add_tree_slopes, fit_joint_duals
 from dano.physics.features import PATCHES, TREES
-from dano.physics.momentum import spin_seen_from
+from dano.physics.momentum import angular_momentum, spin_with
 from dano.physics.pairs import rotation_met
-from dano.physics.real import ONE, TWO
+from dano.physics.real import ONE
+from dano.physics.rotations import from_wxyz, matrix
 from dano.physics.trees.joints import ROOT
 from dano.physics.twists import joined
 
@@ -70,8 +71,10 @@ def settle(
                 omega = row.omega
                 if state.lead < ONE:
                     inertia = scene.bodies[world, i].inertia
-                    omega = spin_seen_from(
-                        omega, inertia, scene.timestep[world, 0], ONE - TWO * state.met, state.lead
+                    h = scene.timestep[world, 0]
+                    ended = matrix(from_wxyz(row.orientation)) * angular_momentum(omega, inertia, h, -ONE)
+                    omega = spin_with(
+                        wp.transpose(rotation_met(state)) * ended, omega, inertia, h, state.lead
                     )
                 spin = rotation_met(state) * omega
                 room.velocity[world, block_of(scene, m)] = joined(row.velocity, spin)

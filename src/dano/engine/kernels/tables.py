@@ -207,7 +207,9 @@ class FoundPair:
     critical: wp.int32  # Sample that says when the bodies meet, −1 where they do not within the step
     share: real  # τ
     hits: wp.int32  # 1 where τ is when the bodies are as deep as in an impact
-    falls: wp.int32  # 1 where bodies fall freely until they meet: then gravity takes part in their way
+    # 1 where the first or the second body falls freely until they meet: then gravity takes part in its way.
+    first_falls: wp.int32
+    second_falls: wp.int32
     # 1 where impulses of an impact on the first or the second body take effect when the bodies meet.
     first_waits: wp.int32
     second_waits: wp.int32

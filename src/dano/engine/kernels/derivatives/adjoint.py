@@ -294,17 +294,19 @@ def advance_work(
     state = given.seen[world, i]
     q = from_wxyz(row.orientation)
     back = wp.transpose(matrix(q))
-    turn = angular_part(moved)
     omega = back * angular_part(velocity)
+    orientation = turned(q, back * angular_part(moved), h)
     if state.lead < ONE:
         gain = matrix(q) * gain_of_row(body, row, h)
         met = rotation_of(body, row, state.met, h)
-        end = end_of_impact(angular_part(velocity), body.inertia, met, gain, h, state.met, state.lead)
+        end = end_of_impact(
+            angular_part(velocity), body.inertia, met, q, angular_part(moved), gain, h, state.met, state.lead
+        )
         omega = end.omega
-        turn = turn + end.turn
+        orientation = end.orientation
     return (
         wp.dot(bar.position, row.position + h * linear_part(moved))
-        + wp.dot(bar.orientation, to_wxyz(turned(q, back * turn, h)))
+        + wp.dot(bar.orientation, to_wxyz(orientation))
         + wp.dot(bar.velocity, linear_part(velocity))
         + wp.dot(bar.omega, omega)
     )

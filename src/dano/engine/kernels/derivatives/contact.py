@@ -298,8 +298,8 @@ def pull_support(
     pair = numbers_of(scene, world, found.pair)
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
-    a = falling(room.bodies[world, index.first], found.falls)
-    b = falling(room.bodies[world, index.second], found.falls)
+    a = falling(room.bodies[world, index.first], found.first_falls)
+    b = falling(room.bodies[world, index.second], found.second_falls)
     toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
     at = met_pair(scene, world, found, a, b, ZERO, toward)
     samples = Touching()
@@ -453,6 +453,6 @@ def pull_pair(
         if wp.length_sq(found.support) > ZERO:
             bar = pull_support(scene, room, world, lane, found, support_bar, by.rests, depth_bar, bar)
     if lane == 0:
-        bar.first = falling_bar(bar.first, found.falls)
-        bar.second = falling_bar(bar.second, found.falls)
+        bar.first = falling_bar(bar.first, found.first_falls)
+        bar.second = falling_bar(bar.second, found.second_falls)
     return bar, by_twists
