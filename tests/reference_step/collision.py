@@ -1,6 +1,5 @@
 """Finding contact: docs/theory/contact.md, "Which side is sampled" and from "Finding contact" on."""
 
-from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +58,7 @@ class Points(NamedTuple):
         part: Share of an impact that the side carries.
         left_out: Share of a sample that rests which has no part in an impact.
         waits: Whether impulses on the first and on the second body take effect when the bodies meet.
+        holds: Whether the bodies lie on each other there while they wait for an impact.
         seen: The bodies with what their velocities gain until then.
     """
 
@@ -91,6 +91,7 @@ class Points(NamedTuple):
     part: float
     left_out: float
     waits: tuple[bool, bool] = (False, False)
+    holds: bool = False
     seen: Bodies | None = None
 
 
@@ -482,7 +483,8 @@ def find(scene, bodies, shares=None):
         given = shares.get((side.i, side.j))
         met = hitting if listed(scene, bodies, side, hitting).beta > 0 else lasting
         found.append(listed(scene, bodies, side, met if given is None else met._replace(share=given)))
-    return together(bodies, halved([points for points in found if len(points.area)], bodies))
+    found = halved([points for points in found if len(points.area)], bodies)
+    return together(bodies, [points for points in found if len(points.area)])
 
 
 def rounded(pair, normal):
@@ -665,41 +667,73 @@ def at_one_moment(side, other, bodies):
     The side that meets first says when. The other takes part if it has met by then, too, but for δ, or else
     in the next step, unless the bodies rest on it: then impulses act from the start of the step.
     """
-    both = side.kappa > 0 and other.kappa > 0
-    if side.kappa == other.kappa == 0:
+    if not (side.kappa > 0 and other.kappa > 0):
         return side
-    if both:
-        earlier, later = sorted((side, other), key=lambda points: (points.share, points[:2]))
-    else:
-        earlier, later = (side, other) if side.kappa > 0 else (other, side)
+    earlier, later = sorted((side, other), key=lambda points: (points.share, points[:2]))
     until = max(earlier.delays * earlier.share, 0)
-    if both and (later.share - earlier.share) * bodies.h * later.nearing <= later.delta:
-        delays = until / side.share if until else 0.0
-    elif not np.any(later.depth > 0):
-        if side is later:
+    delays = until / side.share if until else 0.0
+    if (later.share - earlier.share) * bodies.h * later.nearing > later.delta:
+        if np.any(later.depth > 0):
+            delays = 0.0
+        elif side is later:
             none = {name: getattr(side, name)[:0] for name in OF_POINTS}
             return side._replace(kappa=0.0, delays=0.0, **none)
-        return side
-    elif side.kappa == 0:
-        return side
-    else:
-        delays = 0.0
+        else:
+            return side
     return side._replace(delays=delays, way=(1 - delays) * max(side.share, 0.0))
 
 
 def together(bodies, found):
-    """Sides with impacts: impulses on bodies that move and touch no third one wait for it."""
-    pairs = {frozenset(points[:2]) for points in found}
-    touched = Counter(k for pair in pairs for k in pair)
-    wait = [bool(bodies.moves[k]) and touched[k] == 1 for k in range(len(bodies.mass))]
+    """Sides with impacts: impulses on bodies that have one with one other, and else only lie, wait."""
+    if not any(points.kappa > 0 for points in found):
+        return found
+    partners = [set() for _ in bodies.mass]
+    found = [points._replace(holds=holds(bodies, points)) for points in found]
+    for points in found:
+        if points.kappa > 0 or not is_quiet(bodies, points):
+            partners[points.first].add(points.second)
+            partners[points.second].add(points.first)
+    held = {k for points in found if points.holds for k in points[:2]}
 
     def waiting(points):
         if not points.delays:
             return points
-        i, j = points[:2]
-        if not wait[i] and not wait[j]:
+        carried = held if np.any(points.support) else set()
+        waits = tuple(
+            bool(bodies.moves[k]) and partners[k] == {other} and k not in carried
+            for k, other in (points[:2], points[1::-1])
+        )
+        if not any(waits):
             return points._replace(delays=0.0, way=max(points.share, 0.0))
-        x, other = (points.seen.pose(k, wait[k] * points.delays * points.share)[0] for k in (i, j))
-        return points._replace(waits=(wait[i], wait[j]), com_difference=x - other)
+        return points._replace(waits=waits)
 
-    return [waiting(points) for points in found]
+    found = [waiting(points) for points in found]
+    until = {k: when_met(found, k)[0] for points in found for k in points[:2]}
+
+    def apart(points):
+        x, other = (points.seen.pose(k, until[k])[0] for k in points[:2])
+        return points._replace(com_difference=x - other)
+
+    return [apart(points) for points in found]
+
+
+def is_quiet(bodies, points):
+    """Whether no part of a side gets in that nears the other body by more than it falls in half a step."""
+    slow = 0.5 * bodies.h * np.linalg.norm(bodies.gravity)
+    return not np.any((points.depth - bodies.h * points.rate > 0) & (points.rate < -slow))
+
+
+def holds(bodies, points):
+    """Whether a side holds its bodies while they wait for an impact: it touches, and has none."""
+    return points.kappa == 0 and bool(np.any(points.depth > 0)) and is_quiet(bodies, points)
+
+
+def when_met(found, k):
+    """Share of the step after which impulses on a body take effect, and β; the mean of several."""
+    waiting = [
+        (points.delays * points.share, points.delays)
+        for points in found
+        for i, waits in zip(points[:2], points.waits, strict=True)
+        if waits and i == k
+    ]
+    return np.mean(waiting, axis=0) if waiting else np.zeros(2)

@@ -139,18 +139,6 @@ def as_they_meet(a: BodyState, b: BodyState, found: FoundPair, h: real) -> tuple
 
 
 @wp.func
-def first_until(found: FoundPair) -> real:
-    """Share of the step after which impulses on the first body of a pair take effect."""
-    return real(found.first_waits) * found.impact.delays * found.share
-
-
-@wp.func
-def second_until(found: FoundPair) -> real:
-    """Share of the step after which impulses on the second body of a pair take effect."""
-    return real(found.second_waits) * found.impact.delays * found.share
-
-
-@wp.func
 def facing(
     scene: wp.ref[Scene],
     world: int,

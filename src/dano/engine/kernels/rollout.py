@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.impacts import balance_when_met, find_moved
+from dano.engine.kernels.impacts import any_hits, end_of_step, let_wait
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern, forget_blocks
 from dano.engine.kernels.patches import find_patches
@@ -22,8 +22,8 @@ from dano.engine.kernels.trees.kinematics import (
 )
 from dano.engine.kernels.trees.loops import begin_loops, forces_of
 from dano.physics.features import LANES, PATCHES, TREES
-from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
-from dano.physics.pairs import BodyState, rotation_met
+from dano.physics.momentum import angular_momentum, gyroscopic_gain, turned_inertia
+from dano.physics.pairs import BodyState
 from dano.physics.real import HALF, ONE, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.trees.joints import ROOT
@@ -114,6 +114,7 @@ def begin_body(
     state.ahead = state.orientation
     state.ahead_falling = state.orientation
     state.lead = ONE
+    state.support = h * joined(push.force, push.torque)
     state.com = body.com
     size = ZERO
     if m >= 0:
@@ -301,15 +302,15 @@ def stays_asleep(
 
 
 @wp.func
-def begin_unpushed(
+def begin_again(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, launch: wp.ref[Launch], t: int
 ):
-    """What is known at the start of a step that was not, or need not be, pushed."""
+    """What is known at the start of a step that is made already."""
     if t == 0 or t == launch.n_steps - 1:
         # A launch begins with one of these.
         forget(scene, room, world, lane)
     for i in range(scene.body_index.shape[0]):
-        push = Push()
+        push = push_of(scene, launch, world, t, i)
         begin_body(scene, room, world, i, row_before(scene, launch, world, t, i), push)
     wait()
     if wp.static(TREES):
@@ -328,29 +329,18 @@ def find_touching(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
         room for.
     """
     n_found, overflow = find_contacts(scene, room, world, lane)
-    if wp.static(not TREES):
-        wait()
-        if lane == 0:
-            balance_when_met(scene, room, world, n_found)
     n_near = n_found
     if wp.static(PATCHES):
         n_near = find_patches(scene, room, world, lane, n_found)
     wait()
+    if wp.static(not TREES):
+        let_wait(scene, room, world, lane, n_found, n_near)
     return n_found, n_near, overflow
 
 
 @wp.func
-def any_hits(room: wp.ref[Room], world: int, lane: int, n_found: int) -> bool:
-    """Whether one of the pairs with points has an impact."""
-    hits = bool(False)
-    for f in range(n_found):
-        hits = hits or room.found[world, f * _LANES + lane].impact.stiffness > ZERO
-    return hits
-
-
-@wp.func
 def advance_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, row: StateRow) -> StateRow:
-    """A body at the end of a step: x⁺ = x + h v, q⁺ = q ⊗ turn, with v and turn of `Room.moved`."""
+    """A body at the end of a step, see `end_of_step`."""
     h = scene.timestep[world, 0]
     m = scene.body_index[i].row
     after = row
@@ -360,22 +350,8 @@ def advance_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, r
             if node.kind != _ROOT:
                 return advance_hanging(room, world, m, i, row)
             m = node.place // 6
-        v = room.velocity[world, m]
-        state = room.bodies[world, i]
-        moved = room.moved[world, m]
-        back = wp.transpose(matrix(state.orientation))
-        after.velocity = linear_part(v)
-        after.omega = back * angular_part(v)
-        after.position = row.position + h * linear_part(moved)
-        orientation = turned(state.orientation, back * angular_part(moved), h)
-        if state.lead < ONE:
-            end = end_of_impact(
-                angular_part(v), scene.bodies[world, i].inertia, rotation_met(state), state.orientation,
-                angular_part(moved), state.spin_gain, h, state.met, state.lead,
-            )  # fmt: skip
-            after.omega = end.omega
-            orientation = end.orientation
-        after.orientation = to_wxyz(orientation)
+        inertia = scene.bodies[world, i].inertia
+        after = end_of_step(row, room.bodies[world, i], inertia, room.velocity[world, m], h)
     return after
 
 
@@ -429,8 +405,6 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                     if lane == 0:
                         restart(scene, room, world)
                     wait()
-        wait()
-        find_moved(scene, room, world, lane, n_found)
         wait()
         if lane == 0:
             report = StepReport()

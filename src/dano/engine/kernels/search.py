@@ -7,18 +7,17 @@ is listed if the old velocities take it into the other body by the end of the st
 
 import warp as wp
 
-from dano.engine.kernels.lanes import lanes_where, total, total3, wait
+from dano.engine.kernels.impacts import share_impacts
+from dano.engine.kernels.lanes import lanes_where, total, total3
 from dano.engine.kernels.meeting import Meeting, meeting
 from dano.engine.kernels.near import (
     as_they_meet,
     facing,
-    first_until,
     is_near,
     left_out,
     plane_of,
     posed,
     reach_of_block,
-    second_until,
     solid_of_body,
     stretch_of,
 )
@@ -52,14 +51,13 @@ from dano.physics.impacts import (
 )
 from dano.physics.pairs import (
     BodyState,
-    centres_apart,
     falling,
     is_held,
     PairPose,
     speed_within,
 )
 from dano.physics.point_law import gate_of, Material, point_law
-from dano.physics.real import HALF, ONE, real, TWO, vec3, vec6, ZERO
+from dano.physics.real import ONE, real, TWO, vec3, vec6, ZERO
 from dano.physics.samples import (
     facing_area,
     is_turned,
@@ -72,8 +70,6 @@ from dano.physics.solids.distances import solid_clearance, solid_distance
 from dano.physics.solids.grids import STEEPEST
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
-# What a body touches, besides one other.
-_NOTHING, _SEVERAL = wp.constant(-1), wp.constant(-2)
 
 
 @wp.func
@@ -311,87 +307,6 @@ def find_rest(
 
 
 @wp.func
-def touches(room: wp.ref[Room], world: int, found: FoundPair) -> bool:
-    """Whether a pair touches when the step begins."""
-    deepest = real(0.0)
-    for k in range(found.first, found.end):
-        deepest = wp.max(deepest, room.points[world, k].depth)
-    return total(deepest) > ZERO
-
-
-@wp.func
-def leave_to_next(room: wp.ref[Room], world: int, k: int):
-    """Leave a side of a pair to the next step."""
-    found = room.found[world, k]
-    found.end = found.first
-    found.impact = no_impact(found.impact.depth, found.impact.factor, found.impact.deepest, found.impact.rest)
-    room.found[world, k] = found
-
-
-@wp.func
-def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h: real):
-    """Have impulses of both sides of a pair take effect at one moment: else its momentum would change.
-
-    The side that meets first says when. The other one takes part if it has met by then, too, but for δ. Else
-    it is left to the next step, unless the bodies rest on it: then impulses act from the start of the step.
-
-    Args:
-        room: Where the sides stand.
-        world: The world.
-        earlier: The side that has an impact, of both the one that meets first.
-        later: The other one.
-        h: Timestep [s].
-    """
-    ahead = room.found[world, earlier]
-    behind = room.found[world, later]
-    way = ZERO
-    if behind.impact.stiffness > ZERO:
-        way = (behind.share - ahead.share) * h * -behind.patch.near_rate / behind.patch.near_load
-    if behind.impact.stiffness == ZERO or way > behind.impact.depth:
-        if touches(room, world, behind):
-            room.found[world, earlier].impact = delayed(ahead.impact, ZERO, ahead.share, h)
-            if behind.impact.stiffness > ZERO:
-                room.found[world, later].impact = delayed(behind.impact, ZERO, behind.share, h)
-        else:
-            leave_to_next(room, world, later)
-    else:
-        until = ahead.impact.delays * ahead.share
-        delays = ZERO
-        if until > ZERO:
-            delays = until / behind.share
-        else:
-            room.found[world, earlier].impact = delayed(ahead.impact, ZERO, ahead.share, h)
-        room.found[world, later].impact = delayed(behind.impact, delays, behind.share, h)
-
-
-@wp.func
-def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Have both sides of a pair take part in one impact: samples of the first body, and of the second."""
-    h = scene.timestep[world, 0]
-    for f in range(1, n_found):
-        one = (f - 1) * _LANES + lane
-        other = f * _LANES + lane
-        mine = scene.pair_index[room.found[world, one].pair]
-        theirs = scene.pair_index[room.found[world, other].pair]
-        if mine.first == theirs.second and mine.second == theirs.first:
-            first = room.found[world, one]
-            second = room.found[world, other]
-            hits = first.impact.stiffness > ZERO
-            if wp.static(not TREES):
-                if scene.body_index[mine.first].row >= 0 and scene.body_index[mine.second].row >= 0:
-                    if hits and (second.impact.stiffness == ZERO or first.share <= second.share):
-                        agree_on_moment(room, world, one, other, h)
-                    elif second.impact.stiffness > ZERO:
-                        agree_on_moment(room, world, other, one, h)
-            if (
-                room.found[world, one].impact.stiffness > ZERO
-                and room.found[world, other].impact.stiffness > ZERO
-            ):
-                room.found[world, one].impact.part = HALF
-                room.found[world, other].impact.part = HALF
-
-
-@wp.func
 def lasting_meeting(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
@@ -409,46 +324,6 @@ def lasting_meeting(
     return meeting(
         scene, room, world, lane, falling(a, 0), falling(b, 0), pair, first, second, h, sink, sink, ZERO, ZERO
     )
-
-
-@wp.func
-def note_partner(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int):
-    """Note that a body touches another one; of several, `_SEVERAL`."""
-    if scene.body_index[body].row >= 0:
-        before = room.partners[world, body]
-        room.partners[world, body] = wp.where(before == _NOTHING or before == other, other, _SEVERAL)
-
-
-@wp.func
-def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Have impulses of impacts take effect when bodies meet, on those that touch no others.
-
-    What is pressed from two sides would else go on by what one of them does until the other begins: in a
-    corner that friction jams, the two impulses have no bound.
-    """
-    wait()
-    if lane == 0:
-        for i in range(scene.body_index.shape[0]):
-            room.partners[world, i] = _NOTHING
-        for f in range(n_found):
-            index = scene.pair_index[room.found[world, f * _LANES].pair]
-            note_partner(scene, room, world, index.first, index.second)
-            note_partner(scene, room, world, index.second, index.first)
-    wait()
-    h = scene.timestep[world, 0]
-    for f in range(n_found):
-        k = f * _LANES + lane
-        found = room.found[world, k]
-        if found.impact.delays > ZERO:
-            first = scene.pair_index[found.pair].first
-            second = scene.pair_index[found.pair].second
-            found.first_waits = wp.where(room.partners[world, first] == second, 1, 0)
-            found.second_waits = wp.where(room.partners[world, second] == first, 1, 0)
-            if found.first_waits + found.second_waits == 0:
-                found.impact = delayed(found.impact, ZERO, found.share, h)
-            a, b = as_they_meet(room.bodies[world, first], room.bodies[world, second], found, h)
-            found.com_difference = centres_apart(a, b, first_until(found), second_until(found), h)
-            room.found[world, k] = found
 
 
 @wp.func
@@ -601,8 +476,6 @@ def find_contacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
             if total(real(at - begin)) > ZERO:
                 n_found += 1
     share_impacts(scene, room, world, lane, n_found)
-    if wp.static(not TREES):
-        let_wait(scene, room, world, lane, n_found)
     return n_found, total(wp.where(overflow, ONE, ZERO)) > ZERO
 
 

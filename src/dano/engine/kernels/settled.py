@@ -3,11 +3,10 @@
 import warp as wp
 
 from dano.engine.kernels.assembly import assemble, fit_duals, Trial
-from dano.engine.kernels.impacts import find_moved
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import EVERYWHERE, find_pattern
 from dano.engine.kernels.patches import add_patches, fit_patch_duals
-from dano.engine.kernels.rollout import begin_unpushed, find_touching, Launch
+from dano.engine.kernels.rollout import begin_again, find_touching, Launch
 from dano.engine.kernels.search import fix_laws
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import add_tree_slopes, fit_joint_duals
@@ -59,7 +58,7 @@ def settle(
 ) -> int:
     """A step at its solution: contacts, laws and the Jacobian; returns the number of pairs with points."""
     n = scene.body_index.shape[0]
-    begin_unpushed(scene, room, world, lane, launch, t)
+    begin_again(scene, room, world, lane, launch, t)
     n_found, n_near, _overflow = find_touching(scene, room, world, lane)
     if lane == 0:
         find_pattern(scene, room, world, n_near)
@@ -99,6 +98,4 @@ def settle(
         if lane == 0:
             add_tree_slopes(scene, room, world)
         wait()
-    find_moved(scene, room, world, lane, n_found)
-    wait()
     return n_found

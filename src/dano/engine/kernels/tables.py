@@ -355,9 +355,7 @@ class Room:
         old: Those of the step before; only with joints.
         tried: …
         best: Where the residual was smallest.
-        moved: By which positions change within a step.
         meetings: Of each moving body what waits for when it meets others, see `dano.engine.kernels.impacts`.
-        late: Virtual velocities of impulses that take effect within a step.
         step: Of Newton's method.
         residual: What each block misses [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
@@ -420,7 +418,6 @@ class Room:
     old: wp.array2d(dtype=vec6)
     tried: wp.array2d(dtype=vec6)
     best: wp.array2d(dtype=vec6)
-    moved: wp.array2d(dtype=vec6)
     meetings: wp.array2d(dtype=vec3)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
@@ -429,7 +426,6 @@ class Room:
     trees: TreeRoom
     wrenches: wp.array2d(dtype=vec6)
     if ADJOINTS:
-        late: wp.array2d(dtype=vec6)
         given: Given
         given_trees: GivenTrees
         given_patches: GivenPatches
