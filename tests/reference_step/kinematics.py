@@ -245,6 +245,11 @@ class Kinematics:
         L = R @ momentum(R.T @ w, J, h, self.lead[i])
         return spin_with(matrix(orientation).T @ L, R.T @ w, J, h, -1)
 
+    def balanced(self, i, omega, orientation):
+        """The spin [W] of the balance that leads to a spin [B] and an orientation at the end of a step."""
+        R, R_met, J, h = matrix(orientation), self.rotation_met(i), self.bodies.inertia[i], self.h
+        return R_met @ spin_with(R_met.T @ R @ momentum(omega, J, h, -1), omega, J, h, self.lead[i])
+
     def gaps(self, y):
         """φ: how far loops are open after a step; distances [m, W], then turns of welds [rad]."""
         poses, distances, turns = self.placed(y), [], []
