@@ -61,25 +61,15 @@ _BYTES_PER_NODE = 400
 
 
 class Exported(NamedTuple):
-    """What was written.
+    """What was written."""
 
-    Attributes:
-        folder: Where.
-        files: Names in the folder, sorted.
-        collision: How contact is represented, "coacd" or "hull".
-        pieces: Number of convex pieces.
-        triangles: Number of visible triangles.
-        textured: Whether the colours were known.
-        notes: Sentences on what the formats cannot hold.
-    """
-
-    folder: Path
-    files: list[str]
-    collision: str
-    pieces: int
-    triangles: int
-    textured: bool
-    notes: list[str]
+    folder: Path  # Where
+    files: list[str]  # Names in the folder, sorted
+    collision: str  # How contact is represented, "coacd" or "hull"
+    pieces: int  # Number of convex pieces
+    triangles: int  # Number of visible triangles
+    textured: bool  # Whether the colours were known
+    notes: list[str]  # Sentences on what the formats cannot hold
 
 
 def export_object(

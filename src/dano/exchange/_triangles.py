@@ -35,15 +35,10 @@ _AT_ONCE = 1 << 16
 
 
 class Triangles(NamedTuple):
-    """A triangle mesh.
+    """A triangle mesh."""
 
-    Attributes:
-        vertices: [m, F], shape (v, 3).
-        faces: Rows of `vertices`, counter-clockwise seen from outside, shape (f, 3).
-    """
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices: Float[np.ndarray, "v 3"]  # [m, F], shape (v, 3)
+    faces: Int[np.ndarray, "f 3"]  # Rows of `vertices`, counter-clockwise seen from outside, shape (f, 3)
 
     @property
     def corners(self) -> Float[np.ndarray, "f 3 3"]:
@@ -80,17 +75,11 @@ class Triangles(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """What a homogeneous solid of unit density has.
+    """What a homogeneous solid of unit density has."""
 
-    Attributes:
-        volume: [m³].
-        com: Centroid [m, F], shape (3,).
-        inertia: ∫ (|r|² I − r rᵀ) dV about the centroid [m⁵], shape (3, 3).
-    """
-
-    volume: float
-    com: Float[np.ndarray, "3"]
-    inertia: Float[np.ndarray, "3 3"]
+    volume: float  # [m³]
+    com: Float[np.ndarray, "3"]  # Centroid [m, F], shape (3,)
+    inertia: Float[np.ndarray, "3 3"]  # ∫ (|r|² I − r rᵀ) dV about the centroid [m⁵], shape (3, 3)
 
 
 def enclosed(mesh: Triangles) -> Moments:

@@ -25,30 +25,20 @@ _N_TESTS = 20_000
 
 
 class BakeError(NamedTuple):
-    """How far a baked grid is from its field, at random points that are not nodes.
+    """How far a baked grid is from its field, at random points that are not nodes."""
 
-    Attributes:
-        rms: Root of the mean squared difference, as a fraction of the largest density of the field.
-        max: Largest difference, as a fraction of the largest density of the field.
-        mass: Difference of the integrals ∫φ dx, as a fraction of the field's, with its sign (positive: grid
-            too heavy).
-    """
-
-    rms: float
-    max: float
+    rms: float  # Root of the mean squared difference, as a fraction of the largest density of the field
+    max: float  # Largest difference, as a fraction of the largest density of the field
+    # Difference of the integrals ∫φ dx, as a fraction of the field's, with its sign (positive: grid too
+    # heavy).
     mass: float
 
 
 class Baked(NamedTuple):
-    """A grid and its error.
+    """A grid and its error."""
 
-    Attributes:
-        grid: The baked field.
-        error: Its deviation from the original.
-    """
-
-    grid: GridField
-    error: BakeError
+    grid: GridField  # The baked field
+    error: BakeError  # Its deviation from the original
 
 
 def bake(

@@ -319,17 +319,11 @@ def nonnegative_coefficients(samples: np.ndarray, degree: int) -> np.ndarray:
 
 
 class DensityMoments(NamedTuple):
-    """Moments of a density over all space.
+    """Moments of a density over all space."""
 
-    Attributes:
-        integral: M = ∫ φ dx [density · m³].
-        centroid: c = ∫ x φ dx / M [m, F], shape (3,).
-        second_moment: ∫ φ (x − c)(x − c)ᵀ dx [density · m⁵, axes of F], shape (3, 3).
-    """
-
-    integral: Float[Array, ""]
-    centroid: Float[Array, "3"]
-    second_moment: Float[Array, "3 3"]
+    integral: Float[Array, ""]  # M = ∫ φ dx [density · m³]
+    centroid: Float[Array, "3"]  # c = ∫ x φ dx / M [m, F], shape (3,)
+    second_moment: Float[Array, "3 3"]  # ∫ φ (x − c)(x − c)ᵀ dx [density · m⁵, axes of F], shape (3, 3)
 
 
 class GridField(AbstractField):

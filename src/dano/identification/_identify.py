@@ -1,6 +1,7 @@
 """The verb: from observed motions to parameters, with error bars."""
 
 import dataclasses
+import functools
 import os
 import time
 import warnings
@@ -27,7 +28,7 @@ from dano.identification._residuals import Linearized, shifted, Smoothing
 from dano.identification._scales import check_scales
 from dano.identification._settings import deviations, estimated, IdentifyOptions, Setup
 from dano.identification._settling import ripple_covariance, worth_of
-from dano.identification._uncertainty import Errors, Identification, Minimum, scattered, uncertainty
+from dano.identification._uncertainty import Errors, Fitted, Identification, Minimum, scattered, uncertainty
 from dano.identification._windows import Plan
 from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
@@ -233,16 +234,15 @@ def _identification(
     at_best = problem.simulate(best.x, best.blocks)
     at_start = problem.simulate(space.start, plan.start)
     known = np.asarray(at_best.lengths)
-    seen = known[known >= 0]
-    least = problem.least_variance
     independent = setup.options.independent
-    shared = (space, best.x, best.normal, seen, setup.options.huber, plan.n_data, scene, ripple, least)
-    sure = uncertainty(*shared, None if independent == "numbers" else problem.groups(at_best, independent))
+    fitted = Fitted(space, best.x, best.normal, known[known >= 0], plan.n_data, scene)
+    apart = functools.partial(uncertainty, fitted, setup.options.huber, ripple, problem.least_variance)
+    sure = apart(None if independent == "numbers" else problem.groups(at_best, independent))
     values, errors = values_at(space.selections, best.x, sure.covariance)
     fit_errors = _errors(plan, motions, at_best)
     messages = list(sure.messages)
     if independent == "numbers" and len(motions) > len(space.start) + 1:
-        between = uncertainty(*shared, problem.groups(at_best, "motions"))
+        between = apart(problem.groups(at_best, "motions"))
         messages += scattered(space.labels, sure.covariance, between.covariance, len(motions))
     if failed := int(np.sum(np.asarray(at_best.unconverged))):
         page = see("steps-did-not-converge")

@@ -34,8 +34,32 @@ from dano.scene import Control, Scene, State
 from dano.solvers import bounded_least_squares, eliminated, NormalEquations, Solution, Stop
 
 
-def chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:
-    """Normal equations with one block for each motion, whose windows are tied by their jumps."""
+class _Local(NamedTuple):
+    """The first five of `Linearized`, as arrays of NumPy."""
+
+    loss: np.ndarray
+    gradient: np.ndarray
+    hessian: np.ndarray
+    jump: np.ndarray
+    slope: np.ndarray
+
+    @classmethod
+    def of(cls, found: Linearized) -> "_Local":
+        """Those of a simulation of all windows."""
+        return cls(*(np.asarray(v, float) for v in found[:5]))
+
+
+def chained(p: int, owner: np.ndarray, jumps: Sequence[float], local: _Local) -> NormalEquations:
+    """Normal equations with one block for each motion, whose windows are tied by their jumps.
+
+    Args:
+        p: Number of parameters; other unknowns are a window's own.
+        owner: Motion of each window.
+        jumps: Standard deviation of each number of a jump.
+        local: What was simulated.
+    """
+    loss, gradient, hessian, jump, slope = local
+    k = gradient.shape[1] - p
     counts = np.bincount(owner)
     size = int(counts.max()) * k
     place = np.concatenate([np.arange(n) for n in counts])
@@ -132,8 +156,7 @@ class Problem:
             controls=[None] * len(motions) if policy is not None else _control_list(scene, controls, motions),
             noise=noise,
             initial=initial,
-            window=options.window,
-            continuous=bool(self.ties),
+            options=options,
         )
         self.plan = self._planned()
         self.measured, self._near = True, False
@@ -267,23 +290,23 @@ class Problem:
 
     def assembled(self, found: Linearized) -> NormalEquations:
         """Normal equations of a simulation of all windows."""
-        return self._assembled(*(np.asarray(v, float) for v in found[:5]), owner=self.plan.owner)
+        return self._assembled(_Local.of(found), self.plan.owner)
 
     def groups(self, found: Linearized, independent: str | Sequence[str]) -> Groups:
         """What each independent group of a simulation says of the parameters; see `IdentifyOptions`."""
         labels = _labels(self, independent)
-        arrays = [np.asarray(v, float) for v in found[:5]]
-        parts = []
+        local, parts = _Local.of(found), []
         for label in np.unique(labels):
             mine = labels == label
             _, owner = np.unique(self.plan.owner[mine], return_inverse=True)
-            parts.append(eliminated(self._assembled(*(v[mine] for v in arrays), owner=owner)))
+            parts.append(eliminated(self._assembled(_Local(*(v[mine] for v in local)), owner)))
         return Groups(np.array([g for g, _ in parts]), np.array([h for _, h in parts]))
 
-    def _assembled(self, loss, gradient, hessian, jump, slope, *, owner: np.ndarray) -> NormalEquations:
+    def _assembled(self, local: _Local, owner: np.ndarray) -> NormalEquations:
         p, k = len(self.space.start), self.private
         if self.model.jumps is not None:
-            return chained(p, k, owner, self.model.jumps, loss, gradient, hessian, jump, slope)
+            return chained(p, owner, self.model.jumps, local)
+        loss, gradient, hessian, _, _ = local
         return NormalEquations(
             float(loss.sum()),
             gradient[:, :p].sum(axis=0),

@@ -88,19 +88,12 @@ class Placed(NamedTuple):
 
 
 class Leaves(NamedTuple):
-    """Leaves as rows.
+    """Leaves as rows."""
 
-    Attributes:
-        rows: See `dano.physics.solids.distances.Leaf`.
-        kinds: See `dano.physics.solids.distances.LeafKind`.
-        coefficients: Spline coefficients of all grids, one below the other.
-        bounds: Lower bounds on splines, see `lower_bounds`, one below the other.
-    """
-
-    rows: Float[AnyArray, "leaves 20"]
-    kinds: Int[np.ndarray, "leaves 7"]
-    coefficients: Float[AnyArray, "coefficients 1"]
-    bounds: Float[AnyArray, "bounds 1"]
+    rows: Float[AnyArray, "leaves 20"]  # See `dano.physics.solids.distances.Leaf`
+    kinds: Int[np.ndarray, "leaves 7"]  # See `dano.physics.solids.distances.LeafKind`
+    coefficients: Float[AnyArray, "coefficients 1"]  # Spline coefficients of all grids, one below the other
+    bounds: Float[AnyArray, "bounds 1"]  # Lower bounds on splines, see `lower_bounds`, one below the other
 
 
 def is_known(field: AbstractField) -> bool:

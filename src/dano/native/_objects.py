@@ -38,17 +38,11 @@ _LIBRARIES = {"linux": ("warp.so", "warp-clang.so"), "darwin": ("libwarp.dylib",
 
 
 class Kernel(NamedTuple):
-    """A kernel that can be called.
+    """A kernel that can be called."""
 
-    Attributes:
-        layout: Of its parameters.
-        call: From the addresses of bounds and parameters.
-        address: Of the function itself.
-    """
-
-    layout: Layout
-    call: Any
-    address: int
+    layout: Layout  # Of its parameters
+    call: Any  # From the addresses of bounds and parameters
+    address: int  # Of the function itself
 
 
 class Bounds(ctypes.Structure):

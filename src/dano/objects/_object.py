@@ -57,34 +57,24 @@ _INTERIOR = tuple(field.name for field in dataclasses.fields(Interior))
 
 
 class NeuralObject(eqx.Module):
-    """A density field made ready for simulation.
+    """A density field made ready for simulation."""
 
-    Attributes:
-        samples: Samples of the density near its surface, for the centroid law.
-        surface: Samples on the surface of `solid`, with areas.
-        mass: Mass properties in the field's frame.
-        grid: The field baked for other objects' samples to query, without its floaters; None if there is no
-            field.
-        solid: Signed distance of the object: of {φ = `interior.level`}, without floaters, cavities filled;
-            of a shape, its own. None if there is no field.
-        density_range: Lower and upper density between which the samples lie, shape (2,).
-        bake_error: Root mean square error of `grid` relative to the field's largest density (0 for a grid).
-        interior: What the inside of the field looks like; None for objects made of samples, and in older
-            files.
-        mass_model: How density became mass: "density", "solid", or "given" (static).
-        mass_reason: Why this model, in words (static).
-    """
-
-    samples: ContactSamples
-    surface: SurfaceSamples
-    mass: MassProperties
+    samples: ContactSamples  # Samples of the density near its surface, for the centroid law
+    surface: SurfaceSamples  # Samples on the surface of `solid`, with areas
+    mass: MassProperties  # Mass properties in the field's frame
+    # The field baked for other objects' samples to query, without its floaters; None if there is no field.
     grid: GridField | None
+    # Signed distance of the object: of {φ = `interior.level`}, without floaters, cavities filled; of a shape,
+    # its own. None if there is no field.
     solid: SignedDistanceGrid | None
-    density_range: Float[Array, "2"]
+    density_range: Float[Array, "2"]  # Lower and upper density between which the samples lie, shape (2,)
+    # Root mean square error of `grid` relative to the field's largest density (0 for a grid).
     bake_error: Float[Array, ""]
+    # What the inside of the field looks like; None for objects made of samples, and in older files.
     interior: Interior | None
+    # How density became mass: "density", "solid", or "given" (static).
     mass_model: str = eqx.field(static=True)
-    mass_reason: str = eqx.field(static=True)
+    mass_reason: str = eqx.field(static=True)  # Why this model, in words (static)
 
     def _repr_html_(self) -> str:
         """What notebooks show: mass properties beside a drawing of the surface samples."""

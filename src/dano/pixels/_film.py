@@ -36,17 +36,12 @@ _MOMENTS = 5
 
 
 class Frames(NamedTuple):
-    """Pictures of a rollout.
+    """Pictures of a rollout."""
 
-    Attributes:
-        colour: sRGB of the pixels over the background, shape (frames, pixels, 3).
-        opacity: Share of each pixel that bodies cover, shape (frames, pixels).
-        times: Of the frames since the beginning of the rollout [s], shape (frames,).
-    """
-
+    # sRGB of the pixels over the background, shape (frames, pixels, 3).
     colour: Float[Array, "frames pixels 3"]
-    opacity: Float[Array, "frames pixels"]
-    times: Float[Array, " frames"]
+    opacity: Float[Array, "frames pixels"]  # Share of each pixel that bodies cover, shape (frames, pixels)
+    times: Float[Array, " frames"]  # Of the frames since the beginning of the rollout [s], shape (frames,)
 
 
 def film(

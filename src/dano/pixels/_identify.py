@@ -44,21 +44,16 @@ _SUNK = 0.25
 
 
 class FilmFit(NamedTuple):
-    """Parameters from a film.
+    """Parameters from a film."""
 
-    Attributes:
-        fit: Values with error bars, and the motion that they give; that of the poses if pixels add nothing.
-        poses: The same from the poses alone, which the search began with.
-        tracked: What the film shows at the motion found: quality and status of frames, light, silhouettes.
-        history: Values of the parameters after each pass, the first of them from the poses alone.
-        settled: Whether the last pass moved no value by more than a quarter of its standard error.
-    """
-
+    # Values with error bars, and the motion that they give; that of the poses if pixels add nothing.
     fit: Identification
-    poses: Identification
+    poses: Identification  # The same from the poses alone, which the search began with
+    # What the film shows at the motion found: quality and status of frames, light, silhouettes.
     tracked: Tracked
+    # Values of the parameters after each pass, the first of them from the poses alone.
     history: tuple[Mapping[str, Any], ...]
-    settled: bool
+    settled: bool  # Whether the last pass moved no value by more than a quarter of its standard error
 
     @property
     def lamps(self) -> tuple[Light, ...]:

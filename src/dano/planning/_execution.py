@@ -28,38 +28,23 @@ scene that it does not know: that would be lost, and each update of multipliers 
 
 
 class Replan(NamedTuple):
-    """A new plan on the way.
+    """A new plan on the way."""
 
-    Attributes:
-        step: Of the task.
-        reached: Whether it would have reached the goals.
-        seconds: Time it took [s].
-    """
-
-    step: int
-    reached: bool
-    seconds: float
+    step: int  # Of the task
+    reached: bool  # Whether it would have reached the goals
+    seconds: float  # Time it took [s]
 
 
 @dataclass(frozen=True)
 class Execution:
-    """What came of a plan.
+    """What came of a plan."""
 
-    Attributes:
-        states: Leaves of shape (T · substeps + 1, …).
-        values: Controls [N, N m] of every step of the plan, shape (T, m).
-        goals: How each goal was reached.
-        converged: Whether every step was solved.
-        replans: New plans on the way.
-        seconds: Time it took, with compilation [s].
-    """
-
-    states: State
-    values: Float[Array, "T m"]
-    goals: tuple[GoalError, ...]
-    converged: bool
-    replans: tuple[Replan, ...]
-    seconds: float
+    states: State  # Leaves of shape (T · substeps + 1, …)
+    values: Float[Array, "T m"]  # Controls [N, N m] of every step of the plan, shape (T, m)
+    goals: tuple[GoalError, ...]  # How each goal was reached
+    converged: bool  # Whether every step was solved
+    replans: tuple[Replan, ...]  # New plans on the way
+    seconds: float  # Time it took, with compilation [s]
 
 
 def follow(

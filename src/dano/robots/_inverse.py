@@ -71,26 +71,17 @@ class Target(eqx.Module):
 
 
 class InverseKinematics(NamedTuple):
-    """What inverse kinematics found.
+    """What inverse kinematics found."""
 
-    Attributes:
-        state: The state, which rests.
-        reached: Whether all targets are met to 0.1 mm and 1e-3 rad.
-        position_errors: Distance of each target [m]; NaN where it has no position.
-        angle_errors: Angle of each target [rad]; NaN where it has no orientation.
-        at_limits: Coordinates that lie on a limit.
-        singular: Whether the arm is where some motion of the links needs infinite speeds of the joints, e.g.
-            stretched, or with two axes in line.
-        reason: Which target was missed, by how much and why, or why the search ended.
-    """
-
-    state: State
-    reached: bool
-    position_errors: np.ndarray
-    angle_errors: np.ndarray
-    at_limits: tuple[int, ...]
+    state: State  # The state, which rests
+    reached: bool  # Whether all targets are met to 0.1 mm and 1e-3 rad
+    position_errors: np.ndarray  # Distance of each target [m]; NaN where it has no position
+    angle_errors: np.ndarray  # Angle of each target [rad]; NaN where it has no orientation
+    at_limits: tuple[int, ...]  # Coordinates that lie on a limit
+    # Whether the arm is where some motion of the links needs infinite speeds of the joints, e.g. stretched,
+    # or with two axes in line.
     singular: bool
-    reason: str
+    reason: str  # Which target was missed, by how much and why, or why the search ended
 
 
 def inverse_kinematics(

@@ -53,17 +53,11 @@ _DEEP = 0.1
 
 
 class Doubt(NamedTuple):
-    """Something odd.
+    """Something odd."""
 
-    Attributes:
-        rank: The lowest is said first.
-        text: In one line.
-        subject: "sizes": units, frames and slips; "spin" or "start".
-    """
-
-    rank: int
-    text: str
-    subject: str = "sizes"
+    rank: int  # The lowest is said first
+    text: str  # In one line
+    subject: str = "sizes"  # "sizes": units, frames and slips; "spin" or "start"
 
 
 class SceneWarning(UserWarning):

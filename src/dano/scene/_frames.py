@@ -32,48 +32,30 @@ _MANY_JOINTS = 4
 
 
 class Frames(eqx.Module):
-    """Pose, twist and Jacobian of all n bodies of a scene.
+    """Pose, twist and Jacobian of all n bodies of a scene."""
 
-    Attributes:
-        position: Of the centres of mass [m, W], shape (n, 3).
-        orientation: Unit quaternions wxyz, body → world, shape (n, 4).
-        velocity: Of the centres of mass [m/s, W], shape (n, 3).
-        omega: Angular velocities [rad/s, B], shape (n, 3).
-        jacobian: (velocity, omega) per generalised velocity, shape (n, 6, k). Generalised velocities are
-            velocity [m/s, W] and omega [rad/s, B] of each body that moves freely, then those of the joints.
-    """
-
-    position: Float[Array, "n 3"]
-    orientation: Float[Array, "n 4"]
-    velocity: Float[Array, "n 3"]
-    omega: Float[Array, "n 3"]
+    position: Float[Array, "n 3"]  # Of the centres of mass [m, W], shape (n, 3)
+    orientation: Float[Array, "n 4"]  # Unit quaternions wxyz, body → world, shape (n, 4)
+    velocity: Float[Array, "n 3"]  # Of the centres of mass [m/s, W], shape (n, 3)
+    omega: Float[Array, "n 3"]  # Angular velocities [rad/s, B], shape (n, 3)
+    # (velocity, omega) per generalised velocity, shape (n, 6, k). Generalised velocities are velocity [m/s,
+    # W] and omega [rad/s, B] of each body that moves freely, then those of the joints.
     jacobian: Float[Array, "n 6 k"]
 
 
 class Chains(eqx.Module):
-    """The trees of a scene: layout, arrays over joints, and centres of mass of all bodies.
+    """The trees of a scene: layout, arrays over joints, and centres of mass of all bodies."""
 
-    Attributes:
-        layout: The layout.
-        axis: See `Joint`, as are the next five; shape (j, 3).
-        anchor: Points on the axes.
-        position: Origins at q = 0.
-        orientation: At q = 0.
-        ratio: Of joints that mimic others; 1 for all other joints. Shape (j,).
-        shift: The same; 0 for all other joints.
-        laws: What acts on the coordinates.
-        com: Centres of mass of all bodies [m, F].
-    """
-
-    layout: Layout = eqx.field(static=True)
-    axis: Float[AnyArray, "j 3"]
-    anchor: Float[AnyArray, "j 3"]
-    position: Float[AnyArray, "j 3"]
-    orientation: Float[AnyArray, "j 4"]
+    layout: Layout = eqx.field(static=True)  # The layout
+    axis: Float[AnyArray, "j 3"]  # See `Joint`, as are the next five; shape (j, 3)
+    anchor: Float[AnyArray, "j 3"]  # Points on the axes
+    position: Float[AnyArray, "j 3"]  # Origins at q = 0
+    orientation: Float[AnyArray, "j 4"]  # At q = 0
+    # Of joints that mimic others; 1 for all other joints. Shape (j,).
     ratio: Float[AnyArray, " j"]
-    shift: Float[AnyArray, " j"]
-    laws: JointLaws
-    com: Float[AnyArray, "n 3"]
+    shift: Float[AnyArray, " j"]  # The same; 0 for all other joints
+    laws: JointLaws  # What acts on the coordinates
+    com: Float[AnyArray, "n 3"]  # Centres of mass of all bodies [m, F]
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -111,19 +93,12 @@ class Chains(eqx.Module):
 
 
 class Poses(NamedTuple):
-    """Poses of all bodies, and where the joints are.
+    """Poses of all bodies, and where the joints are."""
 
-    Attributes:
-        position: Of the centres of mass [m, W].
-        orientation: wxyz.
-        axis: Of each joint [W], shape (j, 3).
-        pivot: A point on it [m, W], shape (j, 3).
-    """
-
-    position: Float[AnyArray, "n 3"]
-    orientation: Float[AnyArray, "n 4"]
-    axis: Float[AnyArray, "j 3"]
-    pivot: Float[AnyArray, "j 3"]
+    position: Float[AnyArray, "n 3"]  # Of the centres of mass [m, W]
+    orientation: Float[AnyArray, "n 4"]  # wxyz
+    axis: Float[AnyArray, "j 3"]  # Of each joint [W], shape (j, 3)
+    pivot: Float[AnyArray, "j 3"]  # A point on it [m, W], shape (j, 3)
 
 
 def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[AnyArray, "n 3"]) -> Chains:

@@ -70,32 +70,22 @@ Parts = TypeVar("Parts", tuple[Joint, ...], tuple[Loop, ...])
 
 
 class Scene(eqx.Module):
-    """Everything that stays constant over a rollout. Every array in it is a leaf that can be differentiated.
+    """What stays constant over a rollout. Every array in it is a leaf that can be differentiated."""
 
-    Attributes:
-        bodies: The bodies, in the order that states index.
-        contacts: Which pairs may touch.
-        timestep: h [s].
-        gravity: [m/s², W].
-        twins: For each body the first that is made of the same object: its samples and its solid stand once
-            in memory (static).
-        joints: What hangs on what.
-        others: Pairs of bodies that no contact names; None if they do not touch.
-        room: Chunks of point contacts that a step has room for (static); None leaves it to the engine.
-        loops: What closes chains of joints.
-        sampled: For each body the first with the same samples of its surface, which stand once in memory, as
-            shapes with the same numbers have them (static).
-    """
-
-    bodies: tuple[Body, ...]
-    contacts: tuple[Contact, ...]
-    timestep: Float[Array, ""]
-    gravity: Float[Array, "3"]
+    bodies: tuple[Body, ...]  # The bodies, in the order that states index
+    contacts: tuple[Contact, ...]  # Which pairs may touch
+    timestep: Float[Array, ""]  # h [s]
+    gravity: Float[Array, "3"]  # [m/s², W]
+    # For each body the first that is made of the same object: its samples and its solid stand once in memory
+    # (static).
     twins: tuple[int, ...] = eqx.field(static=True, default=())
-    joints: tuple[Joint, ...] = ()
-    others: Others | None = None
+    joints: tuple[Joint, ...] = ()  # What hangs on what
+    others: Others | None = None  # Pairs of bodies that no contact names; None if they do not touch
+    # Chunks of point contacts that a step has room for (static); None leaves it to the engine.
     room: int | None = eqx.field(static=True, default=None)
-    loops: tuple[Loop, ...] = ()
+    loops: tuple[Loop, ...] = ()  # What closes chains of joints
+    # For each body the first with the same samples of its surface, which stand once in memory, as shapes with
+    # the same numbers have them (static).
     sampled: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod

@@ -136,15 +136,10 @@ _INSIDE = 2e-3
 
 
 class Finding(NamedTuple):
-    """Something that a scene's steps do not resolve, or that is odd.
+    """Something that a scene's steps do not resolve, or that is odd."""
 
-    Attributes:
-        subject: start, support, impacts, spin, walls, masses, sizes, samples, timestep, file or solver.
-        text: What it is and what would help, in words.
-    """
-
-    subject: str
-    text: str
+    subject: str  # start, support, impacts, spin, walls, masses, sizes, samples, timestep, file or solver
+    text: str  # What it is and what would help, in words
 
 
 class SpeedBound(NamedTuple):

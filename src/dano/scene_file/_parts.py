@@ -53,17 +53,11 @@ _WEIGHED = re.compile(r"^(?P<source>.+):(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A part of an object, homogeneous.
+    """A part of an object, homogeneous."""
 
-    Attributes:
-        source: A mesh's file, or a shape.
-        density: Mass per volume [kg/m³].
-        mass: Its mass [kg], instead of the density.
-    """
-
-    source: "str | os.PathLike[str] | AbstractShape"
-    density: int | float | None = None
-    mass: int | float | None = None
+    source: "str | os.PathLike[str] | AbstractShape"  # A mesh's file, or a shape
+    density: int | float | None = None  # Mass per volume [kg/m³]
+    mass: int | float | None = None  # Its mass [kg], instead of the density
 
     def __post_init__(self) -> None:
         """Check it.

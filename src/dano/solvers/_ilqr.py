@@ -182,16 +182,24 @@ def _iteration(
         shorter,
         (two, i.states, i.controls, nothing, jnp.asarray(0)),
     )
-    taken = worth & enough(found[0], found[3])
-    return _updated(i, model, policy, found, taken, good & small, weight, merit, gap, tolerance)
-
-
-def _updated(
-    i: IlqrIterate, model, policy, found, taken, small, weight, merit, gap, tolerance
-) -> IlqrIterate:
     alpha, states, controls, value, _ = found
-    brought = merit - value - (1 - alpha) * weight * gap
-    little = brought <= tolerance * (1 + jnp.abs(value))
+    taken = worth & enough(alpha, value)
+    little = merit - value - (1 - alpha) * weight * gap <= tolerance * (1 + jnp.abs(value))
+    trial = IlqrIterate(states, controls, value, model, policy, i.rho, weight, *i[7:])
+    return _updated(i, trial, alpha, taken, little, good & small)
+
+
+def _updated(i: IlqrIterate, trial: IlqrIterate, alpha, taken, little, small) -> IlqrIterate:
+    """What follows an iterate: its trial if that is taken.
+
+    Args:
+        i: The iterate.
+        trial: A step further, with the model and the policy of the step.
+        alpha: Length of the step.
+        taken: Whether it is.
+        little: Whether it brings little.
+        small: Whether the model promised little.
+    """
     slow = jnp.where(taken, jnp.where(little, i.slow + 1, 0), i.slow)
     less = jnp.where(i.rho <= _FIRST_RHO, 0.0, i.rho / _RHO_FACTOR)
     # A step that had to be cut short says that the model reaches no further: ρ stays.
@@ -204,18 +212,13 @@ def _updated(
     def chosen(new, old):
         return jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
 
-    return IlqrIterate(
-        chosen(states, i.states),
-        chosen(controls, i.controls),
-        chosen(value, i.value),
-        model,
-        policy,
-        rho,
-        weight,
-        ~taken,
-        slow,
-        i.iterations + 1,
-        status,
+    return trial._replace(
+        **{name: chosen(getattr(trial, name), getattr(i, name)) for name in ("states", "controls", "value")},
+        rho=rho,
+        fresh=~taken,
+        slow=slow,
+        iterations=i.iterations + 1,
+        status=status,
     )
 
 

@@ -34,17 +34,12 @@ _ZERO = 1e-12
 
 
 class BoxMinimum(NamedTuple):
-    """The minimiser of gᵀk + ½ kᵀHk in a box.
+    """The minimiser of gᵀk + ½ kᵀHk in a box."""
 
-    Attributes:
-        k: The minimiser, shape (m,).
-        inside: Which unknowns are free to move, shape (m,).
-        factor: Cholesky factor of H with rows and columns of the others replaced by those of the identity,
-            shape (m, m).
-    """
-
-    k: Float[Array, " m"]
-    inside: Bool[Array, " m"]
+    k: Float[Array, " m"]  # The minimiser, shape (m,)
+    inside: Bool[Array, " m"]  # Which unknowns are free to move, shape (m,)
+    # Cholesky factor of H with rows and columns of the others replaced by those of the identity, shape (m,
+    # m).
     factor: Float[Array, "m m"]
 
 
@@ -121,25 +116,15 @@ def _solve(factor: Array, right: Array) -> Array:
 
 
 class NormalEquations(NamedTuple):
-    """Gauss–Newton model of the loss at a point.
+    """Gauss–Newton model of the loss at a point."""
 
-    Attributes:
-        loss: f = ½ Σ r².
-        gradient: g = ∂f/∂x, shape (p,).
-        hessian: H ≈ ∂²f/∂x², shape (p, p).
-        block_gradient: b = ∂f/∂z, shape (m, k).
-        block_hessian: B, shape (m, k, k).
-        coupling: C ≈ ∂²f/∂z∂x, shape (m, k, p).
-        block_losses: Parts of the loss that belong to the blocks, shape (m,).
-    """
-
-    loss: float
-    gradient: np.ndarray
-    hessian: np.ndarray
-    block_gradient: np.ndarray
-    block_hessian: np.ndarray
-    coupling: np.ndarray
-    block_losses: np.ndarray
+    loss: float  # f = ½ Σ r²
+    gradient: np.ndarray  # g = ∂f/∂x, shape (p,)
+    hessian: np.ndarray  # H ≈ ∂²f/∂x², shape (p, p)
+    block_gradient: np.ndarray  # b = ∂f/∂z, shape (m, k)
+    block_hessian: np.ndarray  # B, shape (m, k, k)
+    coupling: np.ndarray  # C ≈ ∂²f/∂z∂x, shape (m, k, p)
+    block_losses: np.ndarray  # Parts of the loss that belong to the blocks, shape (m,)
 
 
 class Stop(enum.Enum):
@@ -159,47 +144,27 @@ class Stop(enum.Enum):
 
 
 class Solution(NamedTuple):
-    """Where a minimisation ended, and why.
+    """Where a minimisation ended, and why."""
 
-    Attributes:
-        x: Shared unknowns, shape (p,).
-        blocks: Private unknowns, as `start_blocks` was given.
-        normal: The model there.
-        stop: Why it ended.
-        losses: Loss at the start and after each accepted step.
-        evaluations: How often `linearize` was called.
-    """
-
-    x: np.ndarray
-    blocks: Any
-    normal: NormalEquations
-    stop: Stop
-    losses: np.ndarray
-    evaluations: int
+    x: np.ndarray  # Shared unknowns, shape (p,)
+    blocks: Any  # Private unknowns, as `start_blocks` was given
+    normal: NormalEquations  # The model there
+    stop: Stop  # Why it ended
+    losses: np.ndarray  # Loss at the start and after each accepted step
+    evaluations: int  # How often `linearize` was called
 
 
 class Iterate(NamedTuple):
-    """Where a minimisation is between two steps, and all that the next one depends on.
+    """Where a minimisation is between two steps, and all that the next one depends on."""
 
-    Attributes:
-        x: Shared unknowns.
-        blocks: Private unknowns.
-        losses: Loss at the start and after each accepted step.
-        damping: Of the next step.
-        growth: By what the damping grows if that one fails.
-        slow: Steps in a row that brought next to nothing.
-        spread: Scales of the shared and of the private unknowns.
-        evaluations: How often `linearize` was called.
-    """
-
-    x: np.ndarray
-    blocks: Any
-    losses: tuple[float, ...]
-    damping: float
-    growth: float
-    slow: int
-    spread: tuple[np.ndarray, np.ndarray]
-    evaluations: int
+    x: np.ndarray  # Shared unknowns
+    blocks: Any  # Private unknowns
+    losses: tuple[float, ...]  # Loss at the start and after each accepted step
+    damping: float  # Of the next step
+    growth: float  # By what the damping grows if that one fails
+    slow: int  # Steps in a row that brought next to nothing
+    spread: tuple[np.ndarray, np.ndarray]  # Scales of the shared and of the private unknowns
+    evaluations: int  # How often `linearize` was called
 
 
 # At the start, and its limits: shares of the diagonal of the normal equations, from rounding to "no step".

@@ -12,7 +12,7 @@ from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Materi
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
 from dano.engine.launching._builds import build_for
 from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchTables
-from dano.engine.launching._plans import Whole
+from dano.engine.launching._plans import WholeNumbers
 from dano.maths import AnyArray, is_traced, library
 from dano.native import (
     balls_around_runs,
@@ -58,7 +58,7 @@ class Tables(eqx.Module):
     """
 
     rows: dict[str, Float[AnyArray, "rows width"]]
-    whole: Whole = eqx.field(static=True)
+    whole: WholeNumbers = eqx.field(static=True)
     features: Features = eqx.field(static=True)
     structure: TreeStructure = eqx.field(static=True)
 
@@ -177,7 +177,7 @@ def scene_tables(scene: Scene) -> Tables:
     if scene.joints:
         of_trees, whole_of_trees = tree_rows(scene, structure)
         arrays, whole = {**arrays, **of_trees}, {**whole, **whole_of_trees}
-    return Tables(arrays, Whole(whole), features, structure)
+    return Tables(arrays, WholeNumbers(whole), features, structure)
 
 
 # Radius of a half-space, which has none.

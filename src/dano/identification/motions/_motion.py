@@ -82,39 +82,30 @@ _INCONSISTENT = 0.5
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Motion:
-    """Observed motion of some bodies. What was not observed is NaN.
+    """Observed motion of some bodies. What was not observed is NaN."""
 
-    Attributes:
-        times: Of the frames [s], increasing, shape (T,).
-        position: Of `point` [m, W], shape (T, n, 3).
-        orientation: Unit quaternions wxyz, body → world, shape (T, n, 4).
-        velocity: Of `point` [m/s, W], shape (T, n, 3).
-        omega: [rad/s, B], shape (T, n, 3).
-        names: Names of the n bodies.
-        point: Whether positions are those of the centres of mass or of the origins of the field frames (F).
-        lag: How long before a frame its velocities hold [s]: half a timestep in a `Trajectory`, because
-            x⁺ = x + h v⁺; 0 for measured ones.
-        covariance: Of each pose, or None if no more is known than one noise for all: of the position [m, W],
-            then of the rotation vector [rad, B] by which the true orientation follows the observed one,
-            shape (T, n, 6, 6); NaN where it is unknown.
-        alike: By how much poses with a covariance may be off in all frames alike, as standard deviations: an
-            offset, in sizes of the body, a turn [rad], and a share by which the body goes too far. None: not
-            at all, and covariances are those of independent errors.
-        q: Coordinates of the joint that each body hangs on [rad or m], or None if they were not observed,
-            shape (T, n, 3): as many numbers as the joint has, then zeros. Poses of such a motion follow from
-            them, and do not count beside them.
-    """
-
-    times: np.ndarray
-    position: np.ndarray
-    orientation: np.ndarray
-    velocity: np.ndarray
-    omega: np.ndarray
-    names: tuple[str, ...]
+    times: np.ndarray  # Of the frames [s], increasing, shape (T,)
+    position: np.ndarray  # Of `point` [m, W], shape (T, n, 3)
+    orientation: np.ndarray  # Unit quaternions wxyz, body → world, shape (T, n, 4)
+    velocity: np.ndarray  # Of `point` [m/s, W], shape (T, n, 3)
+    omega: np.ndarray  # [rad/s, B], shape (T, n, 3)
+    names: tuple[str, ...]  # Names of the n bodies
+    # Whether positions are those of the centres of mass or of the origins of the field frames (F).
     point: str = "com"
+    # How long before a frame its velocities hold [s]: half a timestep in a `Trajectory`, because x⁺ = x + h
+    # v⁺; 0 for measured ones.
     lag: float = 0.0
+    # Of each pose, or None if no more is known than one noise for all: of the position [m, W], then of the
+    # rotation vector [rad, B] by which the true orientation follows the observed one, shape (T, n, 6, 6); NaN
+    # where it is unknown.
     covariance: np.ndarray | None = None
+    # By how much poses with a covariance may be off in all frames alike, as standard deviations: an offset,
+    # in sizes of the body, a turn [rad], and a share by which the body goes too far. None: not at all, and
+    # covariances are those of independent errors.
     alike: tuple[float, float, float] | None = None
+    # Coordinates of the joint that each body hangs on [rad or m], or None if they were not observed, shape
+    # (T, n, 3): as many numbers as the joint has, then zeros. Poses of such a motion follow from them, and do
+    # not count beside them.
     q: np.ndarray | None = None
 
     @classmethod

@@ -6,6 +6,7 @@ it scatters within itself; what reaches it is the light that all others let thro
 neural scattering functions, Yu et al. 2020, "Learning Object-Centric Neural Scattering Functions").
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -52,19 +53,12 @@ _GONE = 1e-6
 
 
 class Part(eqx.Module):
-    """A model somewhere.
+    """A model somewhere."""
 
-    Attributes:
-        model: What it looks like.
-        rotation: Field frame → world, shape (3, 3).
-        position: Of the field frame [m, W], shape (3,).
-        sharpness: Of its surface [1/m], if it has one.
-    """
-
-    model: AbstractModel
-    rotation: Float[Array, "3 3"]
-    position: Float[Array, "3"]
-    sharpness: Float[Array, ""]
+    model: AbstractModel  # What it looks like
+    rotation: Float[Array, "3 3"]  # Field frame → world, shape (3, 3)
+    position: Float[Array, "3"]  # Of the field frame [m, W], shape (3,)
+    sharpness: Float[Array, ""]  # Of its surface [1/m], if it has one
 
     def local(self, origin: Float[Array, "n 3"], direction: Float[Array, "n 3"], limit: Array) -> Rays:
         """Rays [W] in the model's frame, from where they enter its box to where they leave it.
@@ -335,11 +329,20 @@ def through(
     weights, clear = shared_weights([edges for edges, _ in found], [alpha for _, alpha in found], n)
     colour, depth = jnp.zeros((n, 3), jnp.float32), jnp.zeros(n, jnp.float32)
     shares = []
-    for i in range(len(parts)):
-        seen, distance, share = _sent(
-            parts, i, lamps[i], rays[i], found[i][0], weights[i], origins, directions, ambient, sampling
-        )
-        colour, depth = colour + seen, depth + distance
+    for i, (own, (edges, _), weight) in enumerate(zip(rays, found, weights, strict=True)):
+        middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+        k = min(sampling.colours, weight.shape[1])
+        _, chosen = jax.lax.top_k(weight, k)
+        some = jnp.take_along_axis(weight, chosen, axis=1)
+        t = jnp.take_along_axis(middle, chosen, axis=1)
+        world = (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3)
+        view = jnp.repeat(own.direction, k, axis=0)
+        send = functools.partial(radiance, parts, i, lamps[i], world, own.at(t), view, ambient)
+        light = jax.lax.cond(jnp.any(weight > 0), send, lambda world=world: jnp.zeros_like(world))
+        share = jnp.sum(weight, axis=1)
+        whole = (share / jnp.maximum(jnp.sum(some, axis=1), _GONE))[:, None]
+        colour = colour + composite(some, light.reshape(n, k, 3)) * whole
+        depth = depth + jnp.sum(weight * middle, axis=1)
         shares.append(share)
     return colour, depth, shares, clear
 
@@ -388,26 +391,6 @@ def shared_weights(
         weights.append(jnp.maximum(jnp.diff(jnp.take_along_axis(mine, at, axis=1), axis=1), 0))
         start += own.shape[1]
     return weights, jnp.exp(-passed[:, -1])
-
-
-def _sent(parts, i, lamps, rays, edges, weights, origins, directions, ambient, sampling):
-    """Light of one part along rays, its share of their mean depth, and its opacity."""
-    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-    k = min(sampling.colours, weights.shape[1])
-    _, chosen = jax.lax.top_k(weights, k)
-    some = jnp.take_along_axis(weights, chosen, axis=1)
-    t = jnp.take_along_axis(middle, chosen, axis=1)
-    world = (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3)
-    local, view = rays.at(t), jnp.repeat(rays.direction, k, axis=0)
-    light = jax.lax.cond(
-        jnp.any(weights > 0),
-        lambda: radiance(parts, i, lamps, world, local, view, ambient),
-        lambda: jnp.zeros_like(world),
-    )
-    share = jnp.sum(weights, axis=1)
-    whole = (share / jnp.maximum(jnp.sum(some, axis=1), _GONE))[:, None]
-    colour = composite(some, light.reshape(len(share), k, 3)) * whole
-    return colour, jnp.sum(weights * middle, axis=1), share
 
 
 def radiance(parts, i, lamps, world, local, view, ambient):

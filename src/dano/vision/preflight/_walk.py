@@ -34,25 +34,15 @@ _SMALL = 400
 
 
 class WalkCheck(NamedTuple):
-    """What photographs say of themselves.
+    """What photographs say of themselves."""
 
-    Attributes:
-        photographs: How many there are.
-        looked_at: How many of them were looked at.
-        blur: Median measure of blur, from 0, sharp, to 1.
-        marked: How many of those looked at show a marker.
-        markers: Numbers of the markers.
-        masks: Where masks come from: "given", "network", "background" or "table".
-        warnings: Sentences for the user.
-    """
-
-    photographs: int
-    looked_at: int
-    blur: float
-    marked: int
-    markers: tuple[int, ...]
-    masks: str
-    warnings: tuple[str, ...]
+    photographs: int  # How many there are
+    looked_at: int  # How many of them were looked at
+    blur: float  # Median measure of blur, from 0, sharp, to 1
+    marked: int  # How many of those looked at show a marker
+    markers: tuple[int, ...]  # Numbers of the markers
+    masks: str  # Where masks come from: "given", "network", "background" or "table"
+    warnings: tuple[str, ...]  # Sentences for the user
 
 
 def check_walk(

@@ -23,22 +23,14 @@ class HashModel(AbstractMedium):
 
     Density is exp(h₀)/`scale`, h the 16 outputs of the first network; the second takes h and the directions
     of view and light to a colour.
-
-    Attributes:
-        grid: Features of places in the box, as a unit cube.
-        trunk: Features → h.
-        head: (h, view, light) → raw colour.
-        corners: Box [m], shape (2, 3); nothing is outside of it.
-        scale: Length [m] over which a density of h₀ = 0 dims light by 1/e.
-        lit: Whether the colour depends on a light (static).
     """
 
-    grid: HashGrid
-    trunk: Network
-    head: Network
-    corners: Float[Array, "2 3"]
-    scale: Float[Array, ""]
-    lit: bool = eqx.field(static=True)
+    grid: HashGrid  # Features of places in the box, as a unit cube
+    trunk: Network  # Features → h
+    head: Network  # (h, view, light) → raw colour
+    corners: Float[Array, "2 3"]  # Box [m], shape (2, 3); nothing is outside of it
+    scale: Float[Array, ""]  # Length [m] over which a density of h₀ = 0 dims light by 1/e
+    lit: bool = eqx.field(static=True)  # Whether the colour depends on a light (static)
 
     @classmethod
     def create(cls, bounds: Numbers, grid: HashGrid, *, lit: bool, key: PRNGKeyArray) -> "HashModel":

@@ -55,21 +55,13 @@ _USUAL = Doubt()
 
 
 class LearnedField(AbstractField):
-    """An occupancy probability φ = 1/(1 + exp(s d)) ∈ [0, 1] around a learned signed distance d.
+    """An occupancy probability φ = 1/(1 + exp(s d)) ∈ [0, 1] around a learned signed distance d."""
 
-    Attributes:
-        solid: The solid {d < 0}, d made a signed distance again after training.
-        sharpness: s [1/m].
-        model: What was trained, for pictures.
-        drawn_sharpness: Sharpness [1/m] of the model's surface in pictures.
-        doubt: By how much it may be beside the true object.
-    """
-
-    solid: SignedDistanceGrid
-    sharpness: Float[Array, ""]
-    model: SurfaceModel
-    drawn_sharpness: Float[Array, ""]
-    doubt: Doubt = eqx.field(static=True, default=_USUAL)
+    solid: SignedDistanceGrid  # The solid {d < 0}, d made a signed distance again after training
+    sharpness: Float[Array, ""]  # s [1/m]
+    model: SurfaceModel  # What was trained, for pictures
+    drawn_sharpness: Float[Array, ""]  # Sharpness [1/m] of the model's surface in pictures
+    doubt: Doubt = eqx.field(static=True, default=_USUAL)  # By how much it may be beside the true object
 
     @classmethod
     def from_model(cls, model: SurfaceModel, drawn_sharpness: float, doubt: Doubt = _USUAL) -> "LearnedField":

@@ -36,15 +36,10 @@ Share = float | Float[Array, ""]
 
 
 class Network(eqx.Module):
-    """A perceptron with smooth activations on rows, in the layout that trains fastest on a CPU.
+    """A perceptron with smooth activations on rows, in the layout that trains fastest on a CPU."""
 
-    Attributes:
-        weights: One matrix (inputs, outputs) a layer.
-        biases: One vector a layer.
-    """
-
-    weights: tuple[Float[Array, "_ _"], ...]
-    biases: tuple[Float[Array, " _"], ...]
+    weights: tuple[Float[Array, "_ _"], ...]  # One matrix (inputs, outputs) a layer
+    biases: tuple[Float[Array, " _"], ...]  # One vector a layer
 
     @classmethod
     def create(cls, sizes: tuple[int, ...], key: PRNGKeyArray) -> "Network":
@@ -68,22 +63,14 @@ class Appearance(eqx.Module):
 
     ρ(x, ω_light, ω_out) of an object-centric neural scattering function (Yu et al. 2020), with the scattered
     light of the whole object in it: features on a grid say where, a small network what that means.
-
-    Attributes:
-        features: What the network knows about a place, shape (mx, my, mz, k).
-        network: (features, normal, view, light) → colour.
-        origin: Position [m] of node (0, 0, 0).
-        spacing: Distance between nodes [m].
-        lit: Whether the light of the photographs is known (static).
-        near_light: Whether it is a position instead of a direction (static).
     """
 
-    features: Float[Array, "mx my mz k"]
-    network: Network
-    origin: Float[Array, "3"]
-    spacing: Float[Array, ""]
-    lit: bool = eqx.field(static=True)
-    near_light: bool = eqx.field(static=True)
+    features: Float[Array, "mx my mz k"]  # What the network knows about a place, shape (mx, my, mz, k)
+    network: Network  # (features, normal, view, light) → colour
+    origin: Float[Array, "3"]  # Position [m] of node (0, 0, 0)
+    spacing: Float[Array, ""]  # Distance between nodes [m]
+    lit: bool = eqx.field(static=True)  # Whether the light of the photographs is known (static)
+    near_light: bool = eqx.field(static=True)  # Whether it is a position instead of a direction (static)
 
     @classmethod
     def create(
@@ -166,39 +153,26 @@ silhouette do not get worse.
 
 
 class Seen(NamedTuple):
-    """What rays see.
+    """What rays see."""
 
-    Attributes:
-        colour: Light of the object, without what is behind it, shape (rays, 3).
-        opacity: Share of the pixel that the object covers, shape (rays,).
-        depth: Mean distance of what is seen [m], shape (rays,); 0 where nothing is.
-        normal: Mean outward normal, shape (rays, 3), not of unit length.
-    """
-
-    colour: Float[Array, "rays 3"]
-    opacity: Float[Array, " rays"]
-    depth: Float[Array, " rays"]
-    normal: Float[Array, "rays 3"]
+    colour: Float[Array, "rays 3"]  # Light of the object, without what is behind it, shape (rays, 3)
+    opacity: Float[Array, " rays"]  # Share of the pixel that the object covers, shape (rays,)
+    depth: Float[Array, " rays"]  # Mean distance of what is seen [m], shape (rays,); 0 where nothing is
+    normal: Float[Array, "rays 3"]  # Mean outward normal, shape (rays, 3), not of unit length
 
 
 class Sampling(NamedTuple):
-    """How finely rays are sampled (static).
+    """How finely rays are sampled (static)."""
 
-    Attributes:
-        coarse: Sections that look for the object, without derivatives.
-        fine: Sections around it, which give the opacity.
-        colours: Of these, those seen most, whose colour is computed.
-        moves: Whether derivatives see the sections move with the surface. Without it they stand still, which
-            is wrong for what is seen inside an outline, and better behaved far from a match.
-        grazes: Whether one of the fine sections' edges lies where a ray is closest to a surface. Without it
-            what only grazes an object comes out too clear: the silhouette of a soap of 90 pixels was 0.2
-            pixels too small all around, by which it seems 2 % of its size nearer.
-    """
-
-    coarse: int = 48
-    fine: int = 16
-    colours: int = 5
+    coarse: int = 48  # Sections that look for the object, without derivatives
+    fine: int = 16  # Sections around it, which give the opacity
+    colours: int = 5  # Of these, those seen most, whose colour is computed
+    # Whether derivatives see the sections move with the surface. Without it they stand still, which is wrong
+    # for what is seen inside an outline, and better behaved far from a match.
     moves: bool = False
+    # Whether one of the fine sections' edges lies where a ray is closest to a surface. Without it what only
+    # grazes an object comes out too clear: the silhouette of a soap of 90 pixels was 0.2 pixels too small all
+    # around, by which it seems 2 % of its size nearer.
     grazes: bool = False
 
 
@@ -414,21 +388,14 @@ class _OnNodes(AbstractModel):
 
 
 class SurfaceModel(_OnNodes, AbstractSurface):
-    """A solid with a soft surface: a signed distance on a grid.
+    """A solid with a soft surface: a signed distance on a grid."""
 
-    Attributes:
-        distance: Signed distance at the nodes in units of `scale`, negative inside, shape (nx, ny, nz).
-        appearance: What its surface looks like.
-        origin: Position [m] of node (0, 0, 0).
-        spacing: Distance between nodes [m].
-        scale: Half the longest side of the box [m], so that numbers to learn are of order one.
-    """
-
+    # Signed distance at the nodes in units of `scale`, negative inside, shape (nx, ny, nz).
     distance: Float[Array, "nx ny nz"]
-    appearance: Appearance
-    origin: Float[Array, "3"]
-    spacing: Float[Array, ""]
-    scale: Float[Array, ""]
+    appearance: Appearance  # What its surface looks like
+    origin: Float[Array, "3"]  # Position [m] of node (0, 0, 0)
+    spacing: Float[Array, ""]  # Distance between nodes [m]
+    scale: Float[Array, ""]  # Half the longest side of the box [m], so that numbers to learn are of order one
 
     @classmethod
     def create(
@@ -473,19 +440,13 @@ class SurfaceModel(_OnNodes, AbstractSurface):
 
 
 class DensityModel(_OnNodes, AbstractMedium):
-    """A medium: extinction on a grid, as in a plain neural radiance field.
+    """A medium: extinction on a grid, as in a plain neural radiance field."""
 
-    Attributes:
-        raw: Numbers whose softplus is the density in units of 1/`spacing`, shape (nx, ny, nz).
-        appearance: What it looks like.
-        origin: Position [m] of node (0, 0, 0).
-        spacing: Distance between nodes [m].
-    """
-
+    # Numbers whose softplus is the density in units of 1/`spacing`, shape (nx, ny, nz).
     raw: Float[Array, "nx ny nz"]
-    appearance: Appearance
-    origin: Float[Array, "3"]
-    spacing: Float[Array, ""]
+    appearance: Appearance  # What it looks like
+    origin: Float[Array, "3"]  # Position [m] of node (0, 0, 0)
+    spacing: Float[Array, ""]  # Distance between nodes [m]
 
     @classmethod
     def create(

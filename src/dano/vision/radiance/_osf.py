@@ -35,25 +35,16 @@ def encoded(x: Float[Array, "n k"], n_frequencies: int) -> Float[Array, "n e"]:
 
 
 class OSF(AbstractMedium):
-    """Density φ(x) and radiance transfer ρ(x, ω_light, ω_out) by one network.
+    """Density φ(x) and radiance transfer ρ(x, ω_light, ω_out) by one network."""
 
-    Attributes:
-        trunk: Weight (outputs, inputs) and bias of each of eight layers.
-        density_layer: Trunk → raw density.
-        bottleneck: Trunk → 256.
-        head: Bottleneck and encoded directions → 128.
-        colour_layer: Head → raw colour.
-        corners: Box [m] outside of which there is nothing, shape (2, 3).
-        scale: Length of a unit of the network's coordinates [m].
-    """
-
+    # Weight (outputs, inputs) and bias of each of eight layers.
     trunk: tuple[tuple[Float[Array, "_ _"], Float[Array, " _"]], ...]
-    density_layer: tuple[Float[Array, "1 _"], Float[Array, "1"]]
-    bottleneck: tuple[Float[Array, "_ _"], Float[Array, " _"]]
-    head: tuple[Float[Array, "_ _"], Float[Array, " _"]]
-    colour_layer: tuple[Float[Array, "3 _"], Float[Array, "3"]]
-    corners: Float[Array, "2 3"]
-    scale: Float[Array, ""]
+    density_layer: tuple[Float[Array, "1 _"], Float[Array, "1"]]  # Trunk → raw density
+    bottleneck: tuple[Float[Array, "_ _"], Float[Array, " _"]]  # Trunk → 256
+    head: tuple[Float[Array, "_ _"], Float[Array, " _"]]  # Bottleneck and encoded directions → 128
+    colour_layer: tuple[Float[Array, "3 _"], Float[Array, "3"]]  # Head → raw colour
+    corners: Float[Array, "2 3"]  # Box [m] outside of which there is nothing, shape (2, 3)
+    scale: Float[Array, ""]  # Length of a unit of the network's coordinates [m]
 
     @classmethod
     def create(

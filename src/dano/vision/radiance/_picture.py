@@ -16,18 +16,13 @@ _CHUNK = 4096
 
 
 class Picture(NamedTuple):
-    """What a camera sees of an object, in float32.
+    """What a camera sees of an object, in float32."""
 
-    Attributes:
-        colour: sRGB over black, shape (height, width, 3).
-        opacity: Share of each pixel that the object covers, (height, width).
-        depth: Mean distance from the camera of what is seen [m], (height, width); 0 where nothing is.
-        identity: Index of the object that is seen most, (height, width); −1 where more than half is empty.
-    """
-
-    colour: Float[np.ndarray, "height width 3"]
-    opacity: Float[np.ndarray, "height width"]
+    colour: Float[np.ndarray, "height width 3"]  # sRGB over black, shape (height, width, 3)
+    opacity: Float[np.ndarray, "height width"]  # Share of each pixel that the object covers, (height, width)
+    # Mean distance from the camera of what is seen [m], (height, width); 0 where nothing is.
     depth: Float[np.ndarray, "height width"]
+    # Index of the object that is seen most, (height, width); −1 where more than half is empty.
     identity: Int[np.ndarray, "height width"]
 
     def over(
