@@ -1,4 +1,4 @@
-"""What comments say of the fields of a class, as the table of its page in docs/api: an extension of griffe."""
+"""What comments say of the fields of a class, as the table of its page in docs/api: for griffe."""
 
 import ast
 import re

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dano.checks import checked_count, checked_items, checked_kind, checked_optional
+from dano.checks import checked_count, checked_items, checked_kind, checked_optional, checked_progress
 from dano.comparison._bodies import (
     best_level,
     Drop,
@@ -34,6 +34,7 @@ from dano.exchange import convex_hull, enclosed, Moments, signed_distances, soli
 from dano.extras import is_installed
 from dano.fields import AbstractField, AbstractShape, bake, GridField
 from dano.objects import NeuralObject, node_values
+from dano.progress import Progress
 
 TIMESTEP = 0.002
 """Of all engines [s]."""
@@ -134,7 +135,7 @@ def compare(
     drops: int = 3,
     decomposed: bool = True,
     seed: int = 0,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Comparison:
     """Measure the mesh route against the neural object itself.
 
@@ -174,7 +175,7 @@ def compare(
     grid = _grid(thing.grid if field is None else field)
     top = float(grid.values.max())
     chosen = _checked_levels(thing, levels, top)
-    say = progress or (lambda description, share: None)
+    say = checked_progress(progress)
     say("reference", 0.0)
     bench = _bench(thing, truth, drops, seed)
     best = best_level(grid, bench.solid.moments.volume)

@@ -233,8 +233,8 @@ def _igl() -> Any:
 Collision = Literal["auto", "coacd", "hull"]
 
 
-def chosen_collision(collision: str) -> Literal["coacd", "hull"]:
-    """What is made for `collision`: "auto" is CoACD where it is installed.
+def chosen_collision(collision: str, *, solid: bool) -> Literal["coacd", "hull"]:
+    """What is made for `collision`: "auto" is CoACD where it is installed; the hull of what is no solid.
 
     Raises:
         ValueError: If it is not one of the three.
@@ -245,7 +245,7 @@ def chosen_collision(collision: str) -> Literal["coacd", "hull"]:
     installed = is_installed("coacd")
     if collision == "coacd" and not installed:
         load_coacd()
-    return "hull" if collision == "hull" or not installed else "coacd"
+    return "coacd" if collision != "hull" and installed and solid else "hull"
 
 
 def convex_hull(points: Float[np.ndarray, "n 3"]) -> Triangles:

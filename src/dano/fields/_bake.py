@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dano.checks import checked_count, checked_function, checked_kind
+from dano.checks import checked_count, checked_kind, checked_progress
 from dano.fields._base import AbstractField
 from dano.fields._grid import degree_of, GridField
 from dano.fields._host import density_at, host_jet
@@ -75,8 +75,7 @@ def bake(
     resolution = checked_count("resolution", resolution, least=4, most=1024)
     batch_size = checked_count("batch_size", batch_size)
     key = checked_key(key)
-    if progress is not None:
-        checked_function("progress", progress)
+    say = checked_progress(progress)
     lower, upper = np.asarray(field.bounds, dtype=np.float64)
     if not np.all(np.isfinite([lower, upper])):
         raise ValueError(
@@ -92,8 +91,7 @@ def bake(
     n_nodes = int(np.prod(shape))
 
     def report(done: int) -> None:
-        if progress is not None:
-            progress("sampling the field", min(done / n_nodes, 1.0))
+        say("sampling the field", min(done / n_nodes, 1.0))
 
     def nodes(rows: np.ndarray) -> np.ndarray:
         return origin[:, None] + spacing * np.stack(np.unravel_index(rows, shape))

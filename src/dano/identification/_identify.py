@@ -5,14 +5,14 @@ import functools
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from dano.checks import checked_function, checked_items, checked_kind, checked_optional
+from dano.checks import checked_items, checked_kind, checked_optional, checked_progress
 from dano.engine import AbstractEngine, checked_engine, held, Policy
 from dano.identification._checkpoint import digest_of, SearchCheckpoint
 from dano.identification._parameters import (
@@ -33,6 +33,7 @@ from dano.identification._windows import Plan
 from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
 from dano.names import see
+from dano.progress import Progress
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop
 
@@ -52,7 +53,7 @@ def identify(
     after: Identification | None = None,
     options: IdentifyOptions | None = None,
     engine: AbstractEngine | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Identification:
     """Find the parameters of a scene with which it moves as observed.
 
@@ -88,7 +89,8 @@ def identify(
         ValueError: If an argument is out of range, does not fit the others, or makes too much work.
     """
     controls = held(controls)
-    _check(scene, state, controls, progress)
+    tell = checked_progress(progress)
+    _check(scene, state, controls)
     options = checked_optional("options", options, IdentifyOptions) or IdentifyOptions()
     motions = _motions("observed", observed, scene, least=1)
     state = _started_in(scene, motions) if state is None else state
@@ -104,7 +106,7 @@ def identify(
     kept = _kept(setup, motions, state, after)
     beside = _motions("held_out", held_out, scene)
     try:
-        found = _fitted(setup, motions, beside, state, after, kept, progress)
+        found = _fitted(setup, motions, beside, state, after, kept, tell)
     except np.linalg.LinAlgError as error:
         raise ValueError(
             "observed must be motions that the scene can follow, got some from which the simulation ends in"
@@ -122,11 +124,10 @@ def _fitted(
     state: State | Sequence[State | None] | None,
     after: Identification | None,
     kept: SearchCheckpoint,
-    progress: Callable[[str, float], None] | None,
+    tell: Progress,
 ) -> Identification:
     """Searches from all starts, and measures the error on what is held out."""
     began = time.perf_counter()
-    tell = progress or (lambda description, share: None)
     problem = Problem(setup, motions, state)
     problem.check_groups(setup.options.independent)
     if after is not None:
@@ -184,7 +185,7 @@ class _Ended(NamedTuple):
 
 
 def _searched(
-    problem: Problem, options: IdentifyOptions, kept: SearchCheckpoint, tell: Callable[[str, float], None]
+    problem: Problem, options: IdentifyOptions, kept: SearchCheckpoint, tell: Progress
 ) -> list[_Ended]:
     """Where the search from each start ended, best first."""
     ended = []
@@ -321,7 +322,7 @@ def _started_in(scene: Scene, motions: Sequence[Motion]) -> State | None:
     return scene.initial_state()
 
 
-def _check(scene: Any, state: Any, controls: Any, progress: Any) -> None:
+def _check(scene: Any, state: Any, controls: Any) -> None:
     """Check the scene, initial states that were given, and what drives the motions.
 
     Shapes of controls are checked when they are cut to the motions.
@@ -333,8 +334,6 @@ def _check(scene: Any, state: Any, controls: Any, progress: Any) -> None:
     for one in _listed(controls):
         if one is not None and not callable(one):
             checked_kind("controls", one, Control)
-    if progress is not None:
-        checked_function("progress", progress)
 
 
 def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:

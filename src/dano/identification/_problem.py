@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.engine import device_mesh
-from dano.identification._checkpoint import SearchCheckpoint
+from dano.identification._checkpoint import Keep, SearchCheckpoint
 from dano.identification._planes import Smoothing
 from dano.identification._residuals import (
     Linearized,
@@ -31,7 +31,15 @@ from dano.identification._uncertainty import Groups, Identification
 from dano.identification._windows import draw_velocities, plan_windows
 from dano.identification.motions import Motion, QUANTITIES
 from dano.scene import Control, Scene, State
-from dano.solvers import bounded_least_squares, eliminated, NormalEquations, Solution, Stop
+from dano.solvers import (
+    bounded_least_squares,
+    eliminated,
+    Iterate,
+    LeastSquaresOptions,
+    NormalEquations,
+    Solution,
+    Stop,
+)
 
 
 class _Local(NamedTuple):
@@ -49,7 +57,7 @@ class _Local(NamedTuple):
         return cls(*(np.asarray(v, float) for v in found[:5]))
 
 
-def chained(p: int, owner: np.ndarray, jumps: Sequence[float], local: _Local) -> NormalEquations:
+def chained(p: int, owner: np.ndarray, jumps: Array, local: _Local) -> NormalEquations:
     """Normal equations with one block for each motion, whose windows are tied by their jumps.
 
     Args:
@@ -377,24 +385,33 @@ class Problem:
         """
 
         def minimise(x, blocks, tolerance: float, held: bool = not free) -> Solution:
-            begun = functools.partial(
-                bounded_least_squares,
-                self.linearize,
-                x,
-                lower=x if held else self.space.lower,
-                upper=x if held else self.space.upper,
-                start_blocks=blocks,
-                retract=self.retract,
-                max_iterations=max_iterations,
+            options = LeastSquaresOptions(
+                max_iterations,
                 # A step of δ standard errors reduces the loss ½ s² (N − p) by ½ s² δ².
                 tolerance=tolerance**2 / self.freedom,
                 # A step is solved to about the dtype's resolution to the power 3/4.
                 perfect=0.5 * self.plan.n_data * float(jnp.finfo(self.plan.start.position.dtype).eps) ** 0.75,
-                progress=tell,
             )
-            if kept is None:
-                return begun()
-            return kept.minimised(self, lambda since, keep: begun(since=since, keep=keep))
+
+            def begun(since: Iterate | None = None, keep: Keep | None = None) -> Solution:
+                def before_step(now: Iterate) -> None:
+                    if keep is not None:
+                        keep(now)
+                    if tell is not None:
+                        tell(len(now.losses) - 1, now.losses[-1])
+
+                return bounded_least_squares(
+                    self.linearize,
+                    since or x,
+                    lower=x if held else self.space.lower,
+                    upper=x if held else self.space.upper,
+                    start_blocks=blocks,
+                    retract=self.retract,
+                    options=options,
+                    callback=before_step,
+                )
+
+            return begun() if kept is None else kept.minimised(self, begun)
 
         self.smoothing = None
         if self.jumps is None:

@@ -16,7 +16,7 @@ from dano.names import did_you_mean
 from dano.robots._loops import close_loops, loop_gaps
 from dano.robots._robot import check_arguments, Robot
 from dano.scene import Scene, State
-from dano.solvers import bounded_least_squares, NormalEquations
+from dano.solvers import bounded_least_squares, LeastSquaresOptions, NormalEquations
 
 # What a gap in a loop counts for, beside a target's distance.
 _LOOPS = 100.0
@@ -140,9 +140,8 @@ def inverse_kinematics(
         empty = (np.zeros((0, 0)), np.zeros((0, 0, 0)), np.zeros((0, 0, k)), none.ravel())
         return NormalEquations(0.5 * float(residual @ residual), rows.T @ residual, rows.T @ rows, *empty)
 
-    solution = bounded_least_squares(
-        linearize, start, lower=lower, upper=upper, max_iterations=max_iterations, tolerance=1e-12
-    )
+    options = LeastSquaresOptions(max_iterations, tolerance=1e-12)
+    solution = bounded_least_squares(linearize, start, lower=lower, upper=upper, options=options)
     found = scene.filled(dataclasses.replace(resting, q=jnp.asarray(solution.x, dtype)))
     found = close_loops(scene, found) if scene.loops else found
     errors = np.array([_errors(robot, scene, found, target) for target in targets])

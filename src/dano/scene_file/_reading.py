@@ -26,6 +26,7 @@ from dano.maths import is_traced, Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
 from dano.objects import MassModel, NeuralObject
+from dano.progress import Progress
 from dano.robots import close_loops, load_mjcf, load_urdf, Robot
 from dano.scene import (
     Body,
@@ -53,7 +54,6 @@ from dano.scene_file._objects import (
     load_object,
     object_look,
     object_of_file,
-    Progress,
 )
 from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import is_number, located, Table

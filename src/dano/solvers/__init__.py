@@ -8,6 +8,7 @@ from dano.solvers._least_squares import (
     eliminated as eliminated,
     gauss_newton as gauss_newton,
     Iterate as Iterate,
+    LeastSquaresOptions as LeastSquaresOptions,
     NormalEquations as NormalEquations,
     Solution as Solution,
     Stop as Stop,

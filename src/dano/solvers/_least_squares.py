@@ -189,20 +189,33 @@ _AGAIN = (0.1, 1.0, 10.0)
 _SLOW = 3
 
 
+class LeastSquaresOptions(NamedTuple):
+    """When a minimisation ends.
+
+    Attributes:
+        max_iterations: Accepted steps after which to give up.
+        tolerance: Stop when the model promises to reduce the loss by less than this share of it.
+        perfect: Stop when the loss is no larger: what is left is rounding.
+    """
+
+    max_iterations: int = 50
+    tolerance: float = 1e-10
+    perfect: float = 0.0
+
+
+_USUAL = LeastSquaresOptions()
+
+
 def bounded_least_squares(
     linearize: Callable[[np.ndarray, Any], NormalEquations],
-    start: np.ndarray,
+    start: np.ndarray | Iterate,
     *,
     lower: np.ndarray,
     upper: np.ndarray,
     start_blocks: Any = None,
     retract: Callable[[Any, np.ndarray], Any] = lambda blocks, change: blocks,
-    max_iterations: int = 50,
-    tolerance: float = 1e-10,
-    perfect: float = 0.0,
-    progress: Callable[[int, float], None] | None = None,
-    keep: Callable[[Iterate], None] | None = None,
-    since: Iterate | None = None,
+    options: LeastSquaresOptions = _USUAL,
+    callback: Callable[[Iterate], None] | None = None,
 ) -> Solution:
     """Minimise a sum of squares within bounds.
 
@@ -210,33 +223,29 @@ def bounded_least_squares(
         linearize: The normal equations at (x, blocks); a step to where it or its
             derivatives are not finite is rejected.
             After a poor step it is called with the same x again, and other values of some blocks.
-        start: First x, shape (p,).
+        start: First x, shape (p,), or what `callback` was called with: the minimisation goes on there as if
+            it had never stopped.
         lower: Bounds, shape (p,); may be −∞.
         upper: Bounds, shape (p,); may be ∞.
         start_blocks: First private unknowns, of any kind; `linearize` and `retract` understand it.
         retract: Blocks moved by dz, shape (m, k).
-        max_iterations: Accepted steps after which to give up.
-        tolerance: Stop when the model promises to reduce the loss by less than this share of it.
-        perfect: Stop when the loss is no larger: what is left is rounding.
-        progress: Called with the number of accepted steps and the loss. An interrupt (Ctrl-C) ends the
+        options: When it ends.
+        callback: Called before each step with what that depends on. An interrupt (Ctrl-C) ends the
             minimisation with the best point so far.
-        keep: Called before each step with what it depends on.
-        since: What `keep` was called with: the minimisation goes on there as if it had never stopped.
 
     Raises:
         ValueError: If shapes differ, a bound is NaN or crossed, the start lies outside, or the loss or its
             derivatives are not finite there.
     """
-    x, lower, upper = _checked(start, lower, upper)
+    x, lower, upper = _checked(start.x if isinstance(start, Iterate) else start, lower, upper)
+    max_iterations, tolerance, perfect = options
     span = _span(x, lower, upper)
-    now, normal = _begun(linearize, x, start_blocks, since)
+    now, normal = _begun(linearize, start, start_blocks)
     try:
         for iteration in range(len(now.losses) - 1, max_iterations + 1):
-            if keep is not None:
-                keep(now)
+            if callback is not None:
+                callback(now)
             loss = now.losses[-1]
-            if progress is not None:
-                progress(iteration, loss)
             if loss <= max(perfect, np.finfo(float).tiny):
                 return _solution(now, normal, Stop.PERFECT)
             box = lower - now.x, upper - now.x
@@ -263,14 +272,15 @@ def bounded_least_squares(
     return _solution(now, normal, Stop.ITERATIONS)
 
 
-def _begun(linearize, x: np.ndarray, blocks: Any, since: Iterate | None) -> tuple[Iterate, NormalEquations]:
+def _begun(linearize, start: Iterate | np.ndarray, blocks: Any) -> tuple[Iterate, NormalEquations]:
     """Where the first step begins, and the model there.
 
     Raises:
         ValueError: If the loss or its derivatives are not finite there.
     """
-    if since is not None:
-        return since, linearize(since.x, since.blocks)
+    if isinstance(start, Iterate):
+        return start, linearize(start.x, start.blocks)
+    x = np.array(start, dtype=float)
     normal = linearize(x, blocks)
     if not np.isfinite(normal.loss):
         raise ValueError(f"loss must be finite at the start {x.tolist()}, got {normal.loss}")

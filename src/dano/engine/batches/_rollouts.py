@@ -13,7 +13,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.checks import checked_count, checked_function, checked_path
+from dano.checks import checked_count, checked_path, checked_progress
 from dano.engine._controls import Policy
 from dano.engine._rollout import AbstractEngine, checked_engine
 from dano.engine.batches._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
@@ -21,9 +21,8 @@ from dano.engine.batches._input import checked_job, Job
 from dano.engine.batches._kernel import Kept, simulate_rows
 from dano.engine.batches._store import RolloutStore
 from dano.names import see
+from dano.progress import Progress
 from dano.scene import Control, JOINT_QUANTITIES, Scene, State, STATE_SIZES
-
-Progress = Callable[[str, float], None]
 
 # Rollouts that a device computes at once: more no longer fit a core's cache, fewer leave a GPU idle.
 _BATCH = {"cpu": 32}
@@ -212,11 +211,9 @@ def rollouts(
             checked_count(name, size)
     if path is not None:
         checked_path("path", path)
-    if progress is not None:
-        checked_function("progress", progress)
+    tell = checked_progress(progress)
     job = checked_job(scene, states, n_steps, parameters, controls, checked_engine(engine), keep)
     batch, chunk = _sizes(job, mesh, batch_size, chunk_size)
-    tell = progress or (lambda description, share: None)
     if path is None:
         kept = _into_memory(job, mesh, batch, chunk, tell)
         result = _result(kept, job.steps, job.names)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dano.checks import checked_items, checked_kind, checked_path
+from dano.checks import checked_items, checked_kind, checked_path, checked_progress
 from dano.extras import NETWORKS
 from dano.progress import Progress
 from dano.vision.capture import background_mask, is_plain, PosedCamera, read_picture, View
@@ -72,7 +72,7 @@ def check_walk(
         raise ValueError(
             f"photographs must be {FEWEST} at least, 30 to 60 from all sides are usual, got {len(files)}"
         )
-    told = progress or (lambda _what, _share: None)
+    told = checked_progress(progress)
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, _MOST).round().astype(int))]
     folder = mask_folder(files[0], None if masks is None else checked_path("masks", masks))
     seen, broken = _read(chosen, folder, told)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from dano.archive import checked_output, replacing
-from dano.checks import checked_items, checked_optional, checked_path
+from dano.checks import checked_items, checked_optional, checked_path, checked_progress
 from dano.progress import Progress
 from dano.vision.capture import PosedCamera
 from dano.vision.structure._colmap import colmap, opencv, quiet
@@ -123,7 +123,7 @@ def estimate_poses(
         images = checked_path("images", images)
     else:
         images = checked_items("images", images, Path)
-    told = (lambda _what, _share: None) if progress is None else progress
+    told = checked_progress(progress)
     # What is missing is said before work starts.
     colmap()
     opencv()
