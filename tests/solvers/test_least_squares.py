@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from dano.solvers import bounded_least_squares, eliminated, LeastSquaresOptions, NormalEquations, Stop
+from dano.solvers import (
+    bounded_least_squares,
+    eliminated,
+    Iterate,
+    LeastSquaresOptions,
+    NormalEquations,
+    Stop,
+)
 
 ROSENBROCK = (
     lambda x: np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]),
@@ -28,7 +35,7 @@ def solve(problem, start, lower, upper, **options):
 
     return bounded_least_squares(
         linearize,
-        start,
+        start if isinstance(start, Iterate) else np.array(start, float),
         lower=np.array(lower, float),
         upper=np.array(upper, float),
         options=LeastSquaresOptions(max_iterations=200),

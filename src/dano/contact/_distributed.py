@@ -35,7 +35,7 @@ _SHARP_SINKING, _FIXED_SINKING, _SHARP_DEPTH = 1e-4, 1e-5, 2e-4
 _SLOW = 0.2
 
 
-class Material(NamedTuple):
+class Materials(NamedTuple):
     """What the traction at a point depends on besides geometry and velocity; arrays over contacts."""
 
     stiffness: Float[Array, " *n"]  # k [Pa/m]
@@ -204,7 +204,7 @@ def materials(
     groups: Sequence[tuple[DistributedLaw, ContactParams]],
     timestep: Float[AnyArray, ""],
     gravity: Float[AnyArray, ""],
-) -> Material:
+) -> Materials:
     """What points of contacts feel, as arrays over all contacts.
 
     Args:
@@ -225,7 +225,7 @@ def materials(
     strength = xp.where(gravity > 0, gravity, STANDARD_GRAVITY)
     # Sinking from rest by half the depth of an impact makes no impact.
     settling = xp.where(gravity > 0, xp.sqrt(strength * stacked.impact_depth), 0)
-    return Material(
+    return Materials(
         stacked.stiffness,
         stacked.restitution,
         stacked.restitution_velocity,

@@ -29,7 +29,7 @@ from dano.identification._scales import check_scales
 from dano.identification._settings import deviations, estimated, IdentifyOptions, Setup
 from dano.identification._settling import ripple_covariance, worth_of
 from dano.identification._uncertainty import Errors, Fitted, Identification, Minimum, scattered, uncertainty
-from dano.identification._windows import Plan
+from dano.identification._windows import WindowPlan
 from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
 from dano.names import see
@@ -336,7 +336,7 @@ def _check(scene: Any, state: Any, controls: Any) -> None:
             checked_kind("controls", one, Control)
 
 
-def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
+def _errors(plan: WindowPlan, motions: Sequence[Motion], found: Linearized) -> Errors:
     lengths = np.asarray(found.lengths)
     weights = {key: np.asarray(w) for key, w in plan.windows.weights.items()}
     means, finals = {}, {}
@@ -359,7 +359,7 @@ def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
     return Errors(means["position"], finals["position"], means["orientation"], finals["orientation"], rms)
 
 
-def _away(plan: Plan, predicted: State, key: str) -> np.ndarray:
+def _away(plan: WindowPlan, predicted: State, key: str) -> np.ndarray:
     """By how much positions [m] or orientations [rad] are off, shape (windows, frames, bodies)."""
     here, seen = (
         np.asarray(getattr(s, key))[:, :, list(plan.bodies)] for s in (predicted, plan.windows.observed)
@@ -426,7 +426,9 @@ def _way(motions: Sequence[Motion]) -> float:
     return max(ways)
 
 
-def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene: Scene) -> tuple[Motion, ...]:
+def _as_motions(
+    plan: WindowPlan, motions: Sequence[Motion], found: Linearized, scene: Scene
+) -> tuple[Motion, ...]:
     """Predictions at the frames of each motion, of its bodies; NaN for frames before its first window."""
     predicted = {key: np.asarray(getattr(found.predicted, key)) for key in QUANTITIES}
     joints = found.predicted.q

@@ -23,7 +23,7 @@ from dano.identification.motions import (
     SMOOTHING_FRAMES,
 )
 from dano.maths import quat_rotate, quat_to_matrix
-from dano.scene import Control, Layout, Scene, State
+from dano.scene import Control, Scene, State, StateLayout
 
 _TOLD = 3.0
 """Factor of the standard deviations with which velocities from a tracker's poses count besides the poses: the
@@ -175,7 +175,7 @@ class Windows(eqx.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class WindowPlan:
     """Windows, and what the host knows of them."""
 
     windows: Windows  # The windows
@@ -198,7 +198,7 @@ def plan_windows(
     initial: Sequence[str],
     options: IdentifyOptions,
     smoothing: int = SMOOTHING_FRAMES,
-) -> Plan:
+) -> WindowPlan:
     """Cut motions into windows.
 
     Args:
@@ -264,7 +264,7 @@ def plan_windows(
         key: jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype) for key in names
     }
     rows = [piece["rows"] for piece in pieces]
-    return Plan(windows, State(**start), n_steps, owner, rows, tuple(seen), tuple(weights), n_data)
+    return WindowPlan(windows, State(**start), n_steps, owner, rows, tuple(seen), tuple(weights), n_data)
 
 
 def _observed(scene: Scene, motions: Sequence[Motion]) -> list[int]:
@@ -289,7 +289,7 @@ def _stacked(values: list[np.ndarray], fill: float = 0.0) -> np.ndarray:
 
 
 def _weighed(
-    layout: Layout,
+    layout: StateLayout,
     pieces: list[dict],
     seen: Sequence[int],
     noise: Mapping[str, float],

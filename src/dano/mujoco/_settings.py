@@ -31,7 +31,7 @@ _ANGLE = 0.25
 """Most that the spring turns in a timestep [rad]: a rebound takes 12 steps or more."""
 
 
-class Settings(NamedTuple):
+class ContactSettings(NamedTuple):
     """Parameters of the contacts of two geoms, as in `mjContact`."""
 
     dim: int  # Directions of force: 1, 3, 4 or 6
@@ -48,10 +48,10 @@ class Settings(NamedTuple):
         return np.concatenate([np.asarray(part, np.float64) for part in parts])
 
 
-def overriding(model: Any) -> Settings:
+def overriding(model: Any) -> ContactSettings:
     """The model's global contact parameters; of its directions and gap nothing is said."""
     option = model.opt
-    return Settings(0, option.o_friction, option.o_solref, option.o_solimp, float(option.o_margin))
+    return ContactSettings(0, option.o_friction, option.o_solref, option.o_solimp, float(option.o_margin))
 
 
 @functools.cache

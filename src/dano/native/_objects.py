@@ -56,7 +56,7 @@ class Bounds(ctypes.Structure):
         return cls((ctypes.c_uint32 * 2)(count, 1), count, 1)
 
 
-class Launch:
+class KernelLaunch:
     """A launch of a kernel with parameters of its own."""
 
     def __init__(self, kernel: Kernel, parameters: Parameters, count: int):

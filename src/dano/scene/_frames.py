@@ -21,7 +21,7 @@ from dano.maths import (
     quat_rotate,
     with_rows,
 )
-from dano.scene._joints import Joint, joint_laws, JointLaws, Layout
+from dano.scene._joints import Joint, joint_laws, JointLaws, StateLayout
 from dano.scene._states import State, STATE_SIZES
 
 RESOLVED = 0.5
@@ -46,7 +46,7 @@ class Frames(eqx.Module):
 class Chains(eqx.Module):
     """The trees of a scene: layout, arrays over joints, and centres of mass of all bodies."""
 
-    layout: Layout = eqx.field(static=True)  # The layout
+    layout: StateLayout = eqx.field(static=True)  # The layout
     axis: Float[AnyArray, "j 3"]  # See `Joint`, as are the next five; shape (j, 3)
     anchor: Float[AnyArray, "j 3"]  # Points on the axes
     position: Float[AnyArray, "j 3"]  # Origins at q = 0
@@ -92,7 +92,7 @@ class Chains(eqx.Module):
         return with_rows(whole, (places, places), whole[places, places] + armature)
 
 
-class Poses(NamedTuple):
+class BodyPoses(NamedTuple):
     """Poses of all bodies, and where the joints are."""
 
     position: Float[AnyArray, "n 3"]  # Of the centres of mass [m, W]
@@ -101,7 +101,7 @@ class Poses(NamedTuple):
     pivot: Float[AnyArray, "j 3"]  # A point on it [m, W], shape (j, 3)
 
 
-def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[AnyArray, "n 3"]) -> Chains:
+def chains_of(layout: StateLayout, joints: Sequence[Joint], com: Float[AnyArray, "n 3"]) -> Chains:
     """The trees of a scene, in the dtype of the centres of mass [m, F]."""
     names = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
     xp = library(com, *jax.tree.leaves(joints))
@@ -121,7 +121,7 @@ def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[AnyArray, "n 3
     )
 
 
-def joints_of(layout: Layout, kind: str) -> tuple[np.ndarray, np.ndarray]:
+def joints_of(layout: StateLayout, kind: str) -> tuple[np.ndarray, np.ndarray]:
     """Which joints are of a kind, and the first coordinate of each."""
     rows = [j for j, each in enumerate(layout.kinds) if each == kind]
     return np.array(rows, int), np.array([layout.coordinates[j] for j in rows], int)
@@ -137,7 +137,7 @@ def place_links(
     position: Float[AnyArray, "n 3"],
     orientation: Float[AnyArray, "n 4"],
     q: Float[AnyArray, " k"],
-) -> Poses:
+) -> BodyPoses:
     """Poses of all bodies from those of the roots and the joint coordinates.
 
     Args:
@@ -173,7 +173,7 @@ def place_links(
     placed = origin[:-1] + quat_rotate(turned, chains.com)
     # Bodies that hang on nothing stay where they are to the last digit.
     roots = np.array([i not in layout.children for i in range(layout.bodies)])[:, None]
-    return Poses(xp.where(roots, position, placed), turned, axis, pivot)
+    return BodyPoses(xp.where(roots, position, placed), turned, axis, pivot)
 
 
 def _descended(
@@ -245,7 +245,7 @@ def _descended(
     return jax.lax.scan(level, carry, (even, parents[even], joints, bodies))[0]
 
 
-def link_jacobian(chains: Chains, poses: Poses) -> Float[AnyArray, "n 6 k"]:
+def link_jacobian(chains: Chains, poses: BodyPoses) -> Float[AnyArray, "n 6 k"]:
     """Twists (velocity of the centre of mass, spin; W) of all bodies per generalised velocity.
 
     Generalised velocities are velocity and spin of the bodies that move freely, both in W, and those of the
@@ -282,12 +282,12 @@ def link_jacobian(chains: Chains, poses: Poses) -> Float[AnyArray, "n 6 k"]:
     return xp.concatenate([roots.reshape(n, 6, 6 * f), columns.transpose(0, 2, 1)], axis=2)
 
 
-def _turns(layout: Layout, joint: int, part: int) -> bool:
+def _turns(layout: StateLayout, joint: int, part: int) -> bool:
     kind = layout.kinds[joint]
     return kind in ("hinge", "ball") or (kind == "planar" and part == 2)
 
 
-def _directions(chains: Chains, poses: Poses) -> Float[AnyArray, "d 3"]:
+def _directions(chains: Chains, poses: BodyPoses) -> Float[AnyArray, "d 3"]:
     """Axis of each motion of the joints [W]."""
     layout = chains.layout
     directions = poses.axis[np.array([j for j, _, _ in layout.dofs], int)]
@@ -444,7 +444,7 @@ def frames_of(chains: Chains, state: State) -> tuple[Any, ...]:
         poses = place_links(chains, state.position, state.orientation, state.q)
     else:
         none = xp.zeros((0, 3), dtype)
-        poses = Poses(state.position, state.orientation, none, none)
+        poses = BodyPoses(state.position, state.orientation, none, none)
     jacobian = link_jacobian(chains, poses)
     free = np.array(layout.free, int)
     # Spins of free bodies are given in B, all spins are returned in B.

@@ -225,7 +225,7 @@ class Joint(eqx.Module):
 _LAWS = ("limits", "friction", "armature", "stiffness", "motor")
 
 
-class Layout(NamedTuple):
+class StateLayout(NamedTuple):
     """Which numbers say how the bodies of a scene stand and move (static).
 
     Bodies form trees. A tree stands on a body that moves freely, on a fixed one, or on the world; all its
@@ -331,7 +331,7 @@ def layout_of(
     names: tuple[str, ...],
     fixed: tuple[bool, ...],
     joints: tuple[tuple[str | None, str, str, str | None], ...],
-) -> Layout:
+) -> StateLayout:
     """The layout of bodies and joints.
 
     Args:
@@ -381,7 +381,7 @@ def layout_of(
     kinds = tuple(kind for _, _, kind, _ in joints)
     follows = tuple(bool(mimics) for *_, mimics in joints)
     hanging = (parents, children, coordinates, kinds, follows, dofs)
-    return Layout(len(names), moving, free, *hanging, levels, tuple(roots), moved_by)
+    return StateLayout(len(names), moving, free, *hanging, levels, tuple(roots), moved_by)
 
 
 def _coordinates(joints: Sequence[tuple[str | None, str, str, str | None]]):
@@ -431,7 +431,7 @@ class JointLaws(eqx.Module):
     rough: tuple[int, ...] = eqx.field(static=True)
 
 
-def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
+def joint_laws(layout: StateLayout, joints: Sequence[Joint], dtype) -> JointLaws:
     """The laws of the joints of a scene."""
     owners, xp = [joints[j] for j in layout.with_coordinates], maths.library(*jax.tree.leaves(joints))
 

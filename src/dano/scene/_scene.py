@@ -21,9 +21,9 @@ from dano.objects import checked_inertia
 from dano.scene._bodies import Body
 from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, started, state_arrays
 from dano.scene._contacts import Contact, prepared
-from dano.scene._doubts import Doubt, doubts_of_scene, doubts_of_state, say_doubts
+from dano.scene._doubts import doubts_of_scene, doubts_of_state, say_doubts, SceneDoubt
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
-from dano.scene._joints import Joint, Layout, layout_of, Motor
+from dano.scene._joints import Joint, layout_of, Motor, StateLayout
 from dano.scene._loops import check_loops, Loop, Loops, loops_of
 from dano.scene._making import (
     check_contacts,
@@ -188,7 +188,7 @@ class Scene(eqx.Module):
         return title, rows, ("", "body", "mass", "size")
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> StateLayout:
         """Which numbers say how the bodies stand and move."""
         return layout_of(*structure(self.bodies, self.joints))
 
@@ -437,7 +437,7 @@ class Scene(eqx.Module):
         say_doubts(self._doubts_of(state, bodies), stacklevel=3)
         return state
 
-    def doubts(self, state: State, given: ByName | None = None) -> list[Doubt]:
+    def doubts(self, state: State, given: ByName | None = None) -> list[SceneDoubt]:
         """What is odd about the scene and a state: units, frames, slips; none where numbers are traced.
 
         Args:
@@ -450,7 +450,7 @@ class Scene(eqx.Module):
             *self._doubts_of(state, given),
         ]
 
-    def _doubts_of(self, state: State, given: ByName | None) -> list[Doubt]:
+    def _doubts_of(self, state: State, given: ByName | None) -> list[SceneDoubt]:
         """Of a state alone; see `doubts`."""
         if maths.is_traced(state, self.timestep):
             return []

@@ -14,10 +14,10 @@ from dano.solvers._least_squares import (
     Stop as Stop,
 )
 from dano.solvers._trajectory import (
-    Progress as Progress,
     TrajectoryConstraint as TrajectoryConstraint,
     TrajectoryOptions as TrajectoryOptions,
     TrajectoryProblem as TrajectoryProblem,
+    TrajectoryProgress as TrajectoryProgress,
     TrajectorySolution as TrajectorySolution,
     TrajectoryStop as TrajectoryStop,
     Violation as Violation,

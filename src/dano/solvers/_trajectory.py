@@ -153,7 +153,7 @@ class Violation(NamedTuple):
     component: int  # Which of the constraint's numbers it is
 
 
-class Progress(NamedTuple):
+class TrajectoryProgress(NamedTuple):
     """What a callback is told after every iteration."""
 
     update: int  # Number of multiplier updates so far

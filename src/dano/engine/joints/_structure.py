@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
-from dano.scene import Layout
+from dano.scene import StateLayout
 
 _SIX = 6
 _WELD = 6
@@ -55,7 +55,7 @@ class TreeStructure:
 
 @functools.lru_cache(maxsize=256)
 def tree_structure(
-    layout: Layout,
+    layout: StateLayout,
     constant: tuple[bool, ...] = (),
     nonsmooth: tuple[int, ...] = (),
     touching: frozenset[int] = frozenset(),
@@ -112,12 +112,12 @@ class _Nodes:
     """The nodes of a layout, their trees, and which of them stand alone.
 
     Attributes:
-        rows: See `Layout.nodes`.
+        rows: See `StateLayout.nodes`.
         tree: Number of the tree of each node, −1 of one that is alone.
         root: First node of each tree, in the order of nodes.
     """
 
-    def __init__(self, layout: Layout, closing: Iterable[int]):
+    def __init__(self, layout: StateLayout, closing: Iterable[int]):
         self.layout = layout
         self.rows = layout.nodes.reshape(-1, 8)
         self.n_free = 6 * len(layout.free)

@@ -10,7 +10,7 @@ import numpy as np
 from dano.engine.launching._arguments import given_arrays, parameters_of
 from dano.engine.launching._ffi import Call, Handler, register
 from dano.engine.launching._plans import LaunchPlan, Shape
-from dano.native import Kernel, Launch, n_cores, together
+from dano.native import Kernel, KernelLaunch, n_cores, together
 
 # Arrays that worlds work in begin where a line of a cache does [bytes].
 _ALIGNED = 64
@@ -42,7 +42,7 @@ def launched(
 @functools.lru_cache(maxsize=_MOST)
 def _launcher(plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> Handler:
     """What launches so many worlds with numbers of a type."""
-    launcher = _Launcher(plan, batched, n_worlds)
+    launcher = _CpuLauncher(plan, batched, n_worlds)
     return launcher if dtype == np.float64 else _Widened(launcher)
 
 
@@ -54,7 +54,7 @@ def _target(plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, dtype: n
     return name
 
 
-class _Launcher:
+class _CpuLauncher:
     """Handler of launches.
 
     Each share has parameters of its own, which a call takes, points to its buffers, and puts back: so calls
@@ -99,7 +99,7 @@ class _Launcher:
 class _Widened:
     """Handler for numbers of 32 bits: kernels on a CPU read and write 64."""
 
-    def __init__(self, launcher: _Launcher):
+    def __init__(self, launcher: _CpuLauncher):
         self.launcher = launcher
 
     def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call | None) -> None:
@@ -150,5 +150,5 @@ class _Share:
             parameters.point(place, tuple(given.shape[:2]), tuple(given.strides[:2]), given.data)
             parameters.array(place).grad = parameters.array(bars).data
         self._kept = memory, plan
-        self.launch = Launch(kernel, parameters, count)
+        self.launch = KernelLaunch(kernel, parameters, count)
         self.arrays = given_arrays(plan, parameters)

@@ -88,7 +88,7 @@ def _target(plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, build: B
     for device in _devices(platform):
         # Within a call it would be too late: XLA may be recording.
         plan.compile(build, device)
-    register(name, _Launcher(plan, batched, n_worlds, build, platform), platform)
+    register(name, _CudaLauncher(plan, batched, n_worlds, build, platform), platform)
     return name
 
 
@@ -103,7 +103,7 @@ def _devices(platform: str) -> list[str]:
     return [f"cuda:{device.local_hardware_id}" for device in jax.local_devices(backend="cuda")]
 
 
-class _Launcher:
+class _CudaLauncher:
     """Handler of launches.
 
     Each call takes parameters, points them to its buffers, launches and puts them back: a launch has copied

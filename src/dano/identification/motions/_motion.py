@@ -24,7 +24,7 @@ from dano.maths import (
     quat_multiply,
     quat_rotate,
 )
-from dano.scene import Layout, Scene, State, Trajectory
+from dano.scene import Scene, State, StateLayout, Trajectory
 
 if TYPE_CHECKING:
     from dano.vision import Tracked
@@ -410,23 +410,23 @@ def _check_rotation(motion: Motion) -> None:
             )
 
 
-def joint_table(layout: Layout, q: Float[Array, "t k"]) -> Float[Array, "t n 3"]:
+def joint_table(layout: StateLayout, q: Float[Array, "t k"]) -> Float[Array, "t n 3"]:
     """Joint coordinates by the bodies that hang on the joints, as `Motion.q` has them for all n bodies."""
     bodies, parts = _places(layout)
     return jnp.zeros((q.shape[0], layout.bodies, JOINT_NUMBERS), q.dtype).at[:, bodies, parts].set(q)
 
 
-def joint_numbers(layout: Layout, table: np.ndarray) -> np.ndarray:
+def joint_numbers(layout: StateLayout, table: np.ndarray) -> np.ndarray:
     """Joint coordinates (k,) from a row of `joint_table`, shape (n, 3)."""
     return table[_places(layout)]
 
 
-def joint_widths(layout: Layout) -> np.ndarray:
+def joint_widths(layout: StateLayout) -> np.ndarray:
     """How many numbers of its own the joint of each body has, shape (n,)."""
     return np.bincount(_places(layout)[0], minlength=layout.bodies)
 
 
-def _places(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+def _places(layout: StateLayout) -> tuple[np.ndarray, np.ndarray]:
     """Body, and which of the coordinates of its joint, of each coordinate."""
     joints = layout.with_coordinates
     bodies = [layout.children[j] for j in joints]

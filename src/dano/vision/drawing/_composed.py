@@ -27,8 +27,8 @@ from dano.vision.radiance import (
     AbstractSurface,
     composite,
     DRAWING,
-    Picture,
     pixel_order,
+    RenderedPicture,
     Sampling,
     section_weights,
     sections,
@@ -164,7 +164,7 @@ def compose(
     item_lights: dict[int, Sequence[Light]] | None = None,
     ambient: int | float = 0.0,
     sampling: Sampling = DRAWING,
-) -> Picture:
+) -> RenderedPicture:
     """Volume-render several objects together, with the light that each lets through to the others.
 
     Unlike `render`, which draws films of solids quickly, this knows transparency everywhere: overlapping
@@ -227,7 +227,7 @@ def compose(
     colour, opacity, depth, which = columns
     identity = np.where(which >= 0, np.array([*numbers, -1])[which], -1).astype(np.int32)
     shape = camera.height, camera.width
-    return Picture(
+    return RenderedPicture(
         colour.reshape(*shape, 3), opacity.reshape(shape), depth.reshape(shape), identity.reshape(shape)
     )
 

@@ -15,7 +15,7 @@ from dano.fields import AbstractField, check_order, Jet, redistanced, SignedDist
 from dano.maths import Numbers, on_device
 from dano.vision.capture import AbstractCamera
 from dano.vision.radiance._models import Appearance, Network, SurfaceModel
-from dano.vision.radiance._picture import Picture, picture
+from dano.vision.radiance._picture import picture, RenderedPicture
 
 FORMAT, VERSION = "dano-learned-field", 1
 
@@ -148,7 +148,7 @@ class LearnedField(AbstractField):
         cut = eqx.tree_at(lambda m: m.distance, model, jnp.maximum(model.distance, below[None, None]))
         return LearnedField.from_model(cut, float(self.drawn_sharpness), self.doubt)
 
-    def picture(self, camera: AbstractCamera, light: Numbers | None = None) -> Picture:
+    def picture(self, camera: AbstractCamera, light: Numbers | None = None) -> RenderedPicture:
         """What a camera sees.
 
         Args:

@@ -15,7 +15,7 @@ _CHUNK = 4096
 """Rays per call: some tens of MB of intermediates."""
 
 
-class Picture(NamedTuple):
+class RenderedPicture(NamedTuple):
     """What a camera sees of an object, in float32."""
 
     colour: Float[np.ndarray, "height width 3"]  # sRGB over black, shape (height, width, 3)
@@ -41,7 +41,7 @@ def picture(
     sharpness: float = 1.0,
     *,
     sampling: Sampling = DRAWING,
-) -> Picture:
+) -> RenderedPicture:
     """Render a model through a camera, chunk by chunk."""
     pixels, rays = rays_of(camera, light, box, occupied)
     shape = camera.height, camera.width
@@ -59,7 +59,7 @@ def picture(
         depth[pixels[part]] = np.asarray(seen.depth)[:n]
     opacity = opacity.reshape(shape)
     identity = np.where(opacity > 0.5, 0, -1).astype(np.int32)
-    return Picture(colour.reshape(*shape, 3), opacity, depth.reshape(shape), identity)
+    return RenderedPicture(colour.reshape(*shape, 3), opacity, depth.reshape(shape), identity)
 
 
 @functools.lru_cache(maxsize=8)
