@@ -33,17 +33,13 @@ class Replanning:
 
     The old plan is the first guess. Contact depends on the timestep: a push takes other speeds at h than at
     h/4. New plans may take smaller steps than the plan: give `scene` the timestep of the plant.
-
-    Attributes:
-        scene: What new plans believe. Its timestep is that of the plan, or that divided by a whole number;
-            controls are held over a step of the plan all the same.
-        every: Steps between new plans.
-        ilqr: Of new plans.
     """
 
+    # What new plans believe. Its timestep is that of the plan, or that divided by a whole number; controls
+    # are held over a step of the plan all the same.
     scene: Scene
-    every: int
-    ilqr: TrajectoryOptions = NEW_PLANS
+    every: int  # Steps between new plans
+    ilqr: TrajectoryOptions = NEW_PLANS  # Of new plans
 
     def __post_init__(self) -> None:
         """Check all.

@@ -190,17 +190,11 @@ _SLOW = 3
 
 
 class LeastSquaresOptions(NamedTuple):
-    """When a minimisation ends.
+    """When a minimisation ends."""
 
-    Attributes:
-        max_iterations: Accepted steps after which to give up.
-        tolerance: Stop when the model promises to reduce the loss by less than this share of it.
-        perfect: Stop when the loss is no larger: what is left is rounding.
-    """
-
-    max_iterations: int = 50
-    tolerance: float = 1e-10
-    perfect: float = 0.0
+    max_iterations: int = 50  # Accepted steps after which to give up
+    tolerance: float = 1e-10  # Stop when the model promises to reduce the loss by less than this share of it
+    perfect: float = 0.0  # Stop when the loss is no larger: what is left is rounding
 
 
 _USUAL = LeastSquaresOptions()

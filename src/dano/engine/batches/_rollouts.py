@@ -34,27 +34,17 @@ _LATE = 60.0
 
 
 class Rollouts(eqx.Module):
-    """Many rollouts of n bodies: a leading axis of r rollouts, then k kept states.
+    """Many rollouts of n bodies: a leading axis of r rollouts, then k kept states."""
 
-    Attributes:
-        steps: After how many steps each kept state stands, shape (k,); 0 is the initial state.
-        times: [s], shape (r, k).
-        states: States, leaves of shape (r, k, n, ·).
-        converged: Whether every step of a rollout reached the solver's tolerance, shape (r,).
-        first_unconverged: First step of a rollout that did not, shape (r,); −1: none.
-        unconverged: How many steps of a rollout did not, shape (r,).
-        residual: Largest residual of any step, as in `Trajectory.residuals` [m/s, rad/s], shape (r,).
-        names: Names of the bodies.
-    """
-
-    steps: Int[Array, " k"]
-    times: Float[Array, "r k"]
-    states: State
-    converged: Bool[Array, " r"]
-    first_unconverged: Int[Array, " r"]
-    unconverged: Int[Array, " r"]
+    steps: Int[Array, " k"]  # After how many steps each kept state stands, shape (k,); 0 is the initial state
+    times: Float[Array, "r k"]  # [s], shape (r, k)
+    states: State  # States, leaves of shape (r, k, n, ·)
+    converged: Bool[Array, " r"]  # Whether every step of a rollout reached the solver's tolerance, shape (r,)
+    first_unconverged: Int[Array, " r"]  # First step of a rollout that did not, shape (r,); −1: none
+    unconverged: Int[Array, " r"]  # How many steps of a rollout did not, shape (r,)
+    # Largest residual of any step, as in `Trajectory.residuals` [m/s, rad/s], shape (r,).
     residual: Float[Array, " r"]
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # Names of the bodies
 
 
 class StoredRollouts:

@@ -48,19 +48,13 @@ SWEPT = 48
 
 
 class Tables(eqx.Module):
-    """A scene for kernels.
+    """A scene for kernels."""
 
-    Attributes:
-        rows: Real numbers by place in a kernel's parameters, arrays of rows.
-        whole: Whole numbers (static).
-        features: What kernels must know of the scene (static).
-        structure: Kinematic trees and loops (static).
-    """
-
+    # Real numbers by place in a kernel's parameters, arrays of rows.
     rows: dict[str, Float[AnyArray, "rows width"]]
-    whole: WholeNumbers = eqx.field(static=True)
-    features: Features = eqx.field(static=True)
-    structure: TreeStructure = eqx.field(static=True)
+    whole: WholeNumbers = eqx.field(static=True)  # Whole numbers (static)
+    features: Features = eqx.field(static=True)  # What kernels must know of the scene (static)
+    structure: TreeStructure = eqx.field(static=True)  # Kinematic trees and loops (static)
 
     @property
     def numbers(self) -> dict[str, int]:

@@ -35,6 +35,7 @@ from dano.vision.radiance import (
     Share,
     stratified_edges,
     transmittance,
+    Vectors,
 )
 
 _CHUNK = 1024
@@ -60,7 +61,7 @@ class Part(eqx.Module):
     position: Float[Array, "3"]  # Of the field frame [m, W], shape (3,)
     sharpness: Float[Array, ""]  # Of its surface [1/m], if it has one
 
-    def local(self, origin: Float[Array, "n 3"], direction: Float[Array, "n 3"], limit: Array) -> Rays:
+    def local(self, origin: Vectors, direction: Vectors, limit: Array) -> Rays:
         """Rays [W] in the model's frame, from where they enter its box to where they leave it.
 
         Args:
@@ -111,17 +112,13 @@ class PaintedSolid(AbstractSurface):
         room = jnp.broadcast_to(0.02 * jnp.max(bounds[1] - bounds[0]), (3,))
         return bounds + jnp.stack([-room, room])
 
-    def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def distance_at(self, points: Vectors) -> Float[Array, " n"]:
         """Signed distances [m] of the shape."""
         return self.shape.sdf_jet(points.T, 0)
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """Lambert's law: albedo times the cosine to the light, as sRGB."""
         _, slope = self.shape.sdf_jet(points.T, 1)
         normal = slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-12)[:, None]
@@ -141,17 +138,13 @@ class PaintedMedium(AbstractMedium):
         """Of the grid."""
         return self.grid.bounds
 
-    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def density_at(self, points: Vectors) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m]."""
         return self.scale * self.grid.jet(points.T, 0)
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """The albedo as sRGB; no normals."""
         return jnp.broadcast_to(_encoded(self.albedo)[None], points.shape), jnp.zeros_like(points)
 
@@ -302,12 +295,12 @@ def _composed(parts, planes, lamps, origin, directions, ambient, sampling):
 def through(
     parts: tuple[Part, ...],
     lamps: Sequence[tuple[Light, ...]],
-    origins: Float[Array, "n 3"],
-    directions: Float[Array, "n 3"],
+    origins: Vectors,
+    directions: Vectors,
     limit: Float[Array, " n"],
     ambient: float | Float[Array, ""] | None,
     sampling: Sampling,
-) -> tuple[Float[Array, "n 3"], Float[Array, " n"], list[Float[Array, " n"]], Float[Array, " n"]]:
+) -> tuple[Vectors, Float[Array, " n"], list[Float[Array, " n"]], Float[Array, " n"]]:
     """What rays [W] see of parts before they end.
 
     Args:
@@ -436,7 +429,7 @@ def _reaching(parts, points, towards, away):
 
 
 def reached_through(
-    part: Part, points: Float[Array, "n 3"], towards: Float[Array, "n 3"], away: Float[Array, " n"]
+    part: Part, points: Vectors, towards: Vectors, away: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """Transmittance of a part between points [m, W] and a lamp at distances `away` [m]."""
     rays = part.local(points, towards, away)

@@ -17,6 +17,7 @@ from dano.vision.radiance._models import (
     Seen as Seen,
     Share as Share,
     SurfaceModel as SurfaceModel,
+    Vectors as Vectors,
 )
 from dano.vision.radiance._osf import OSF as OSF
 from dano.vision.radiance._picture import (

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.archive import read_archive, write_archive
 from dano.fields import HashGrid
 from dano.maths import Numbers
-from dano.vision.radiance._models import AbstractMedium, Network, Share
+from dano.vision.radiance._models import AbstractMedium, Network, Share, Vectors
 
 FORMAT, VERSION = "dano-hash-model", 1
 _WIDTH, _CODE = 64, 16  # as Müller et al.
@@ -58,13 +58,13 @@ class HashModel(AbstractMedium):
         """`corners`."""
         return self.corners
 
-    def _code_at(self, points: Float[Array, "n 3"]) -> tuple[Float[Array, "n 16"], Array]:
+    def _code_at(self, points: Vectors) -> tuple[Float[Array, "n 16"], Array]:
         lower, upper = self.bounds.astype(points.dtype)
         inside = jnp.all((points >= lower[None]) & (points <= upper[None]), axis=1)
         unit = jnp.clip((points - lower[None]) / (upper - lower)[None], 0, 1)
         return self.trunk(self.grid(unit)), inside
 
-    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def density_at(self, points: Vectors) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m], zero outside of the bounds."""
         code, inside = self._code_at(points)
         # Beyond e¹⁵ nothing gets through anyway, and gradients stay finite.
@@ -72,12 +72,8 @@ class HashModel(AbstractMedium):
         return jnp.where(inside, density, 0)
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """See `AbstractModel.colour`; no normals."""
         code, _ = self._code_at(points)
         inputs = [code, view_share * view, *([light] if self.lit else [])]

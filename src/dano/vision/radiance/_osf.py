@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import read_archive, write_archive
 from dano.maths import Numbers
-from dano.vision.radiance._models import AbstractMedium, Share
+from dano.vision.radiance._models import AbstractMedium, Share, Vectors
 
 FORMAT, VERSION = "dano-osf", 1
 # The architecture of michguo/osf, as above.
@@ -102,7 +102,7 @@ class OSF(AbstractMedium):
         """`corners`."""
         return self.corners
 
-    def _trunk_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n w"]:
+    def _trunk_at(self, points: Vectors) -> Float[Array, "n w"]:
         code = encoded(points / self.scale.astype(points.dtype), _POSITION_FREQUENCIES)
         h = code
         for i, layer in enumerate(self.trunk):
@@ -112,7 +112,7 @@ class OSF(AbstractMedium):
                 h = jnp.concatenate([code, h], axis=1)
         return h
 
-    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def density_at(self, points: Vectors) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m], zero outside of the bounds."""
         raw = _affine(self.density_layer, self._trunk_at(points))[:, 0]
         lower, upper = self.bounds.astype(points.dtype)
@@ -120,12 +120,8 @@ class OSF(AbstractMedium):
         return jnp.where(inside, jax.nn.relu(raw) / self.scale.astype(points.dtype), 0)
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """ρ, a sigmoid stretched to [−0.1, 1.1] so that black and white can be reached; no normals."""
         middle = _affine(self.bottleneck, self._trunk_at(points))
         directions = [encoded(x, _DIRECTION_FREQUENCIES) for x in (view_share * view, light)]
