@@ -143,11 +143,11 @@ def outcome(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         runs = [
-            follow(plant, given.state, given.task, made, substeps=4, feedback=feedback).goals[0].error
+            follow(plant, given.state, given.task, made, feedback=feedback).goals[0].error
             for plant, feedback in ((finer, False), (rougher, False), (rougher, True))
         ]
         mpc = follow(
-            rougher, given.state, given.task, made, substeps=4, scene=finer, feedback=False, every=EVERY
+            rougher, given.state, given.task, made, replanning=dano.Replanning(finer, EVERY), feedback=False
         )
     replans = sorted(replan.seconds for replan in mpc.replans)
     return Outcome(

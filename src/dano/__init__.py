@@ -113,6 +113,7 @@ from dano.planning import (
     Plan as Plan,
     plan as plan,
     PlanOptions as PlanOptions,
+    Replanning as Replanning,
     SamplingOptions as SamplingOptions,
     Task as Task,
 )

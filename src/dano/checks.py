@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from dano.names import did_you_mean
+from dano.progress import Progress
 
 T = TypeVar("T")
 
@@ -159,6 +160,15 @@ def checked_function(name: str, value: Any) -> Callable[..., Any]:
     if not callable(value):
         raise ValueError(f"{name} must be a function, got {shown(value)}")
     return value
+
+
+def checked_progress(progress: Progress | None) -> Progress:
+    """`progress` if it can be called; a function that does nothing if it is None.
+
+    Raises:
+        ValueError: If it is something else.
+    """
+    return (lambda description, share: None) if progress is None else checked_function("progress", progress)
 
 
 def checked_path(name: str, value: object) -> Path:

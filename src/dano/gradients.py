@@ -68,17 +68,11 @@ class Line(NamedTuple):
 
 
 class Check(NamedTuple):
-    """What derivatives at a point are worth; printed, it is a table.
+    """What derivatives at a point are worth; printed, it is a table."""
 
-    Attributes:
-        value: Of the function at the point.
-        steps: In units of the scale, largest first.
-        lines: One for each direction.
-    """
-
-    value: float
-    steps: tuple[float, ...]
-    lines: tuple[Line, ...]
+    value: float  # Of the function at the point
+    steps: tuple[float, ...]  # In units of the scale, largest first
+    lines: tuple[Line, ...]  # One for each direction
 
     @property
     def trusted(self) -> bool:
@@ -332,15 +326,15 @@ def _line(
     cubic = np.polynomial.Polynomial.fit(at, values, 3)(at) if finite else values
     roughness = float(np.sqrt(np.sum((values - cubic) ** 2) / max(1, len(at) - 4))) if finite else math.nan
     noise = _ROUNDINGS * spacing * float(np.max(np.abs(values))) if finite else math.nan
-    verdict = Verdict.LOST
-    if finite:
-        verdict = _verdict(at, values, derivative, slopes, steps, roughness, spread, tolerance, noise)
+    line = Line(label, at, values, derivative, slopes, roughness, spread, Verdict.LOST)
     of = [number / length for number in (derivative, *slopes)]
-    return Line(label, at, values, of[0], tuple(of[1:]), roughness, spread, verdict)
+    verdict = _verdict(line, steps, tolerance, noise) if finite else Verdict.LOST
+    return line._replace(derivative=of[0], slopes=tuple(of[1:]), verdict=verdict)
 
 
-def _verdict(at, values, derivative, slopes, steps, roughness, spread, tolerance, noise: float) -> Verdict:
-    """See `Verdict`; all by distances in units of the scale."""
+def _verdict(line: Line, steps: tuple[float, ...], tolerance: float, noise: float) -> Verdict:
+    """See `Verdict`; derivative and slopes of the line are by distances in units of the scale."""
+    _, at, values, derivative, slopes, roughness, spread, _ = line
     largest, least = steps[0], steps[-1]
     steepest = spread / (2 * largest)
     if spread <= noise and abs(derivative) * largest <= max(noise, tolerance * spread):

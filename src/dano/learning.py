@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dano.checks import checked_count, checked_number, checked_optional, checked_path
+from dano.checks import checked_count, checked_number, checked_optional, checked_path, checked_progress
 from dano.fields import bake, GridField
 from dano.objects import NeuralObject
 from dano.progress import Progress
@@ -89,7 +89,7 @@ def train_object(
     options = checked_optional("options", options, TrainOptions) or TrainOptions()
     if not isinstance(photographs, Capture):
         photographs = checked_path("photographs", photographs)
-    say = progress or _silent
+    say = checked_progress(progress)
     capture, given = _masked(photographs, downscale, network, table, say)
     if views is not None:
         capture = capture.thinned(views)
@@ -114,10 +114,6 @@ def train_object(
         progress=say,
     )
     return LearnedObject(made, trained, bake(trained.field, options.resolution).grid, given)
-
-
-def _silent(what: str, share: float) -> None:
-    del what, share
 
 
 def _masked(

@@ -12,7 +12,7 @@ from vision import sliding_box, tabletop
 from dano.cli.film import Film, STAGES
 from dano.cli.film._after import _on_table, stages_after
 from dano.cli.film._before import stages_before
-from dano.cli.film._grades import Grade, grades_of, Verdict, verdict_of, write_verdict
+from dano.cli.film._grades import FrictionVerdict, Grade, grades_of, verdict_of, write_verdict
 from dano.cli.film._place import place_of
 from dano.cli.film._slide import find_slide
 from dano.cli.film._stages import run_stages, Stage
@@ -176,13 +176,13 @@ def test_a_stage_that_is_too_bad_ends_it_unless_forced(kitchen: Kitchen):
 
 
 def test_a_friction_is_as_wide_as_what_it_was_made_of():
-    clean = Verdict.of(0.3, 0.004, 0.9, 0.02, 0.0025)
+    clean = FrictionVerdict.of(0.3, 0.004, 0.9, 0.02, 0.0025)
     assert clean.error == pytest.approx(np.hypot(0.004, 0.3 * 0.0025))
-    missed = Verdict.of(0.3, 0.004, 4.2, 0.02, 0.0)
+    missed = FrictionVerdict.of(0.3, 0.004, 4.2, 0.02, 0.0)
     assert missed.error == pytest.approx(4.2 * 0.004)
-    shredded = Verdict.of(0.3, 0.004, 1.0, 0.13, 0.0)
+    shredded = FrictionVerdict.of(0.3, 0.004, 1.0, 0.13, 0.0)
     assert shredded.error == pytest.approx(np.hypot(0.004, 0.3 * 0.1))
-    assert Verdict.of(0.3, None, 1.0, 0.0, 0.0).error is None
+    assert FrictionVerdict.of(0.3, None, 1.0, 0.0, 0.0).error is None
 
 
 def test_a_number_is_good_up_to_what_is_usual_and_one_that_is_not_known_is_poor():

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from vision.tabletop import camera, FOCAL, TAG_SIDE, write_pictures
 
-from dano.cli._arguments import Poses
+from dano.cli._arguments import FindPoses
 from dano.cli._learn import _ends, _known_length
 from dano.vision import load_capture
 
@@ -67,12 +67,12 @@ def test_json_holds_the_same_in_numbers_and_failures_end_in_a_line(photos: Path,
 
 def test_ends_are_read_with_names_that_hold_colons(tmp_path: Path):
     assert _ends("12:30.jpg:1,2:3.5,4") == ("12:30.jpg", (1.0, 2.0, 3.5, 4.0))
-    command = Poses(
+    command = FindPoses(
         photos := tmp_path, output=tmp_path / "t.json", length=0.2, ends=("a:1,2:3,4", "b:5,6:7,8")
     )
     known = _known_length(command)
     assert known is not None and known.length == 0.2 and known.ends["b"] == (5, 6, 7, 8)
-    assert _known_length(Poses(photos, output=tmp_path / "t.json")) is None
+    assert _known_length(FindPoses(photos, output=tmp_path / "t.json")) is None
 
 
 def test_ctrl_c_leaves_nothing(photos: Path, run, tmp_path: Path, interruptible, monkeypatch):

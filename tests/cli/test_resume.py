@@ -112,7 +112,7 @@ def test_progress_is_told_in_files_too(monkeypatch, capsys):
     monkeypatch.setattr(_console, "QUIET", 10.0)
     now = iter([0.0, 1.0, 11.0, 12.0, 31.0])
     monkeypatch.setattr(_console.time, "monotonic", lambda: next(now))
-    progress = _console.Progress()
+    progress = _console.ProgressLine()
     for share in (0.0, 0.25, 0.3, 0.75):
         progress("simulating", share)
     assert capsys.readouterr().err == ("dano: simulating 25 %, 30 s left\ndano: simulating 75 %, 10 s left\n")

@@ -353,7 +353,8 @@ def test_an_impact_soon_after_the_first_frame():
     seen = dano.Motion.from_trajectory(run)
     nothing = np.full(seen.velocity.shape, np.nan)
     poses = dataclasses.replace(seen, velocity=nothing, omega=nothing)
-    options = {"states": [None], "controls": [control], "noise": NOISE, "window": 10, "continuous": True}
+    windows = dano.IdentifyOptions(window=10, continuity=1.0)
+    options = {"states": [None], "controls": [control], "noise": NOISE, "options": windows}
     initial = ("position", "orientation", "velocity", "omega")
     start = plan_windows(scene, [poses], initial=initial, **options).start
     narrow = plan_windows(scene, [poses], initial=initial, smoothing=3, **options).start
@@ -385,8 +386,7 @@ def test_a_first_velocity_is_not_moved_across_an_impact():
             controls=[None],
             noise=NOISE,
             initial=(),
-            window=2,
-            continuous=False,
+            options=dano.IdentifyOptions(window=2),
         )
         return np.asarray(plan.start.velocity[:, 0, 2])
 

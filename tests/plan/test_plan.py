@@ -182,23 +182,27 @@ def test_new_plans_on_the_way_make_up_for_another_mass(pushing, pushed):
     scene, state, task = pushing
     plant = scene.replace_body("cube", mass_scale=1.3)
     blind = dano.follow(plant, state, task, pushed, feedback=False)
-    again = dano.follow(plant, state, task, pushed, scene=scene, every=10, feedback=False)
+    again = dano.follow(
+        plant, state, task, pushed, replanning=dano.Replanning(scene, every=10), feedback=False
+    )
     assert [replan.step for replan in again.replans] == [10, 20, 30]
     assert again.goals[0].error < 0.5 * blind.goals[0].error
     # Where new plans know the scene, they say that they reach what the first one did, and do.
-    sure = dano.follow(scene, state, task, pushed, scene=scene, every=20, feedback=False)
+    sure = dano.follow(
+        scene, state, task, pushed, replanning=dano.Replanning(scene, every=20), feedback=False
+    )
     assert all(replan.reached for replan in sure.replans)
     assert sure.goals[0].error <= 2 * pushed.goals[0].within
     assert again.values.shape == pushed.values.shape and again.converged
     same = dano.follow(scene, state, task, pushed)
     np.testing.assert_allclose(same.states.position[-1], pushed.trajectory.states.position[-1], atol=1e-6)
-    with pytest.raises(ValueError, match="scene must be given with every"):
-        dano.follow(plant, state, task, pushed, every=5)
-    with pytest.raises(ValueError, match="substeps must be 1, the plan's timestep divided by that of plant"):
-        dano.follow(plant, state, task, pushed, substeps=2)
+    with pytest.raises(ValueError, match="scene must be a Scene, got NoneType"):
+        dano.Replanning(None, every=5)  # pyright: ignore[reportArgumentType]
     odd = dataclasses.replace(scene, timestep=jnp.asarray(0.015))
-    with pytest.raises(ValueError, match="timestep of scene must be the plan's 0.02 s or that divided by"):
-        dano.follow(plant, state, task, pushed, scene=odd, every=5)
+    with pytest.raises(
+        ValueError, match="timestep of replanning.scene must be the plan's 0.02 s or that divided by"
+    ):
+        dano.follow(plant, state, task, pushed, replanning=dano.Replanning(odd, every=5))
 
 
 def test_new_plans_may_take_the_steps_of_the_plant(pushing, pushed):
@@ -209,7 +213,9 @@ def test_new_plans_may_take_the_steps_of_the_plant(pushing, pushed):
     exact = dano.Task(task.n_steps, task.actuators, [goal])
     missed = {}
     for name, believed in (("h", scene), ("h/4", plant)):
-        run = dano.follow(plant, state, exact, pushed, scene=believed, substeps=4, every=20, feedback=False)
+        run = dano.follow(
+            plant, state, exact, pushed, replanning=dano.Replanning(believed, every=20), feedback=False
+        )
         assert run.states.position.shape[0] == 4 * task.n_steps + 1 and run.converged
         missed[name] = run.goals[0].error
     assert missed["h/4"] < 0.5 * missed["h"], missed

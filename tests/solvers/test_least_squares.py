@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from dano.solvers import bounded_least_squares, eliminated, NormalEquations, Stop
+from dano.solvers import (
+    bounded_least_squares,
+    eliminated,
+    Iterate,
+    LeastSquaresOptions,
+    NormalEquations,
+    Stop,
+)
 
 ROSENBROCK = (
     lambda x: np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]),
@@ -19,7 +26,7 @@ DECAY = (
 
 def solve(problem, start, lower, upper, **options):
     residual, jacobian = problem
-    p = len(start)
+    p = 2
 
     def linearize(x, _):
         r, j = residual(x), jacobian(x)
@@ -28,10 +35,10 @@ def solve(problem, start, lower, upper, **options):
 
     return bounded_least_squares(
         linearize,
-        np.array(start, float),
+        start if isinstance(start, Iterate) else np.array(start, float),
         lower=np.array(lower, float),
         upper=np.array(upper, float),
-        max_iterations=200,
+        options=LeastSquaresOptions(max_iterations=200),
         **options,
     )
 
@@ -187,7 +194,7 @@ def test_a_block_that_hardly_answers_does_not_run_off():
         upper=np.array([5.0]),
         start_blocks=np.zeros(3),
         retract=lambda blocks, change: blocks + change[:, 0],
-        max_iterations=100,
+        options=LeastSquaresOptions(max_iterations=100),
     )
     assert found.x[0] == pytest.approx(truth, abs=2e-3)
     np.testing.assert_allclose(found.blocks[:2], turns[:2], atol=5e-3)
@@ -216,7 +223,7 @@ def test_says_why_it_stopped():
         np.array([-1.2, 1.0]),
         lower=np.full(2, -2.0),
         upper=np.full(2, 2.0),
-        max_iterations=2,
+        options=LeastSquaresOptions(max_iterations=2),
     )
     assert few.stop is Stop.ITERATIONS
     # A gradient of the wrong sign: nothing helps, and that is said.
@@ -226,14 +233,22 @@ def test_says_why_it_stopped():
 
 
 def test_an_interrupt_keeps_the_best_point():
-    def stop_at_three(iteration, loss):
-        if iteration == 3:
+    def stop_at_three(now):
+        if len(now.losses) == 4:
             raise KeyboardInterrupt
 
-    found = solve(ROSENBROCK, (-1.2, 1.0), (-2, -2), (2, 2), progress=stop_at_three)
+    found = solve(ROSENBROCK, (-1.2, 1.0), (-2, -2), (2, 2), callback=stop_at_three)
     assert found.stop is Stop.INTERRUPTED
     assert len(found.losses) == 4
     assert found.normal.loss == found.losses[-1]
+
+
+def test_goes_on_where_it_was():
+    seen = []
+    whole = solve(ROSENBROCK, (-1.2, 1.0), (-2, -2), (2, 2), callback=seen.append)
+    rest = solve(ROSENBROCK, seen[5], (-2, -2), (2, 2))
+    np.testing.assert_array_equal(rest.x, whole.x)
+    np.testing.assert_array_equal(rest.losses, whole.losses)
 
 
 @pytest.mark.parametrize(

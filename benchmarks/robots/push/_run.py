@@ -86,10 +86,10 @@ def _plan_rows(scene: dano.Scene, plants: list[dano.Scene], cases: list[_case.Ca
         plan = dano.plan(scene, case.state, case.task, controls=case.guess)
         made.append(plan)
         given = case.state, case.task, plan
-        runs = [follow(plant, *given, substeps=4, feedback=False) for plant in plants]
+        runs = [follow(plant, *given, feedback=False) for plant in plants]
         executed.append([run.goals[0].error for run in runs])
         runs = [
-            follow(plant, *given, substeps=4, scene=plants[0], feedback=False, every=EVERY)
+            follow(plant, *given, replanning=dano.Replanning(plants[0], EVERY), feedback=False)
             for plant in plants
         ]
         renewed.append([max(goal.error for goal in run.goals) for run in runs])

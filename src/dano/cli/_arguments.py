@@ -45,7 +45,7 @@ class Train:
 
 
 @dataclass(frozen=True)
-class Poses:
+class FindPoses:
     """Find where photographs were taken from: structure from motion. For `dano data` and `dano train`.
 
     Lengths are metres only if a printed marker or a measured length says so. Without either the result says
@@ -206,7 +206,7 @@ class Simulate:
 
 
 @dataclass(frozen=True)
-class Plan:
+class PlanTask:
     """Find forces that do a task: bring bodies to goals, through contact."""
 
     scene: Positional[Path]  # Scene file (.toml)

@@ -3,7 +3,7 @@
 from dano import comparison
 from dano.checks import checked_number
 from dano.cli._arguments import Compare
-from dano.cli._console import Progress, put, put_json
+from dano.cli._console import ProgressLine, put, put_json
 from dano.cli._outputs import check_output
 from dano.fields import AbstractShape, load_field
 from dano.report import verdict, write_comparison_report
@@ -26,7 +26,7 @@ def compare(arguments: Compare) -> None:
             )
     field = None if arguments.field is None else load_field(arguments.field)
     made = load_object(arguments.object)
-    progress = Progress()
+    progress = ProgressLine()
     found = comparison.compare(
         made,
         field=field,

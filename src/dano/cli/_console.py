@@ -15,7 +15,7 @@ QUIET = 10.0
 """Seconds between two lines of progress where stderr is not a terminal (convention)."""
 
 
-class Progress:
+class ProgressLine:
     """A line on stderr that says what is being done, how far it is, and how long it still takes.
 
     Where stderr is not a terminal, such as a file, it says so in a line every ten seconds. An interrupt

@@ -9,8 +9,8 @@ import numpy as np
 
 from dano import vision
 from dano.archive import write_json
-from dano.cli._arguments import CheckPhotographs, Poses, Train
-from dano.cli._console import numbers, Progress, put, put_json, say
+from dano.cli._arguments import CheckPhotographs, FindPoses, Train
+from dano.cli._console import numbers, ProgressLine, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, chosen, picture_of
 from dano.cli.tracking.filming import focal_of
 from dano.fields import save_field
@@ -18,12 +18,12 @@ from dano.learning import LearnedObject, train_object
 from dano.objects import NeuralObject
 
 
-def poses(command: Poses) -> None:
+def poses(command: FindPoses) -> None:
     """See `dano poses --help`."""
     check_output(command.output, command.images, suffix=".json")
     lens = {"focal": focal_of(command.focal), "known_length": _known_length(command)}
     options = chosen(vision.PoseOptions, command, **lens)
-    progress = Progress()
+    progress = ProgressLine()
     found = vision.estimate_poses(
         [command.images, *command.further] if command.further else command.images,
         options,
@@ -41,7 +41,7 @@ def poses(command: Poses) -> None:
     put(f"wrote {command.output}: next, `dano data {command.output}` and `dano train {command.output}`")
 
 
-def _known_length(command: Poses) -> vision.KnownLength | None:
+def _known_length(command: FindPoses) -> vision.KnownLength | None:
     if (command.length is None) != (not command.ends):
         raise ValueError(
             "length and ends belong together: --length 0.2 --ends a.jpg:120,80:410,95 b.jpg:96,70:377,101"
@@ -137,7 +137,7 @@ def look(
         downscale: Average so many pixels a side into one.
         table: Height z of the table that the object stands on [m]; None: it is not known.
     """
-    progress = Progress()
+    progress = ProgressLine()
     progress("reading photographs", 0.0)
     capture = vision.load_capture(images, downscale=downscale)
     given = capture.has_masks
@@ -217,7 +217,7 @@ def train(command: Train) -> None:
     check_distinct(**outputs, json=command.json)
     checkpoint = outputs["checkpoint"]
     before = _written_at(checkpoint)
-    progress = Progress()
+    progress = ProgressLine()
     try:
         learned = train_object(
             command.images,

@@ -17,7 +17,7 @@ import numpy as np
 from dano import exchange, fields, objects, robots, scene_file
 from dano.building import BuildOptions
 from dano.cli._arguments import BuildObject, Export, Import, Inspect
-from dano.cli._console import numbers, Progress, put, put_json
+from dano.cli._console import numbers, ProgressLine, put, put_json
 from dano.cli._outputs import check_output, picture_of
 from dano.contact import ContactParams
 from dano.maths import Pose
@@ -33,7 +33,7 @@ def export(arguments: Export) -> None:
     if name is None:
         word = re.sub(r"\W", "_", arguments.object.stem, flags=re.ASCII)
         name = word if re.match(r"[A-Za-z]", word) else f"object_{word}"
-    progress = Progress()
+    progress = ProgressLine()
     written = exchange.export_object(
         made,
         arguments.output,
@@ -83,7 +83,7 @@ def import_field(command: Import) -> None:
         raise ValueError(f"resolution must lie between 4 and 1024 nodes, got {resolution}")
     moved = np.any(command.position) or command.orientation != (1.0, 0.0, 0.0, 0.0)
     pose = Pose(command.position, command.orientation) if moved else None
-    progress = Progress()
+    progress = ProgressLine()
     progress("reading the field", 0.0)
     box = None if command.crop is None else np.reshape(command.crop, (2, 3))
     sampled = {}
@@ -146,7 +146,7 @@ def _write_folder(command: Import, field: fields.GridField, pose: Pose | None) -
     options = BuildOptions(
         mass_model="solid", mass=command.mass, mass_scale=_WATER if command.mass is None else None
     )
-    progress = Progress()
+    progress = ProgressLine()
     made = scene_file.build_object(field, options, weighed=True, dashes="--", progress=progress)
     splats = fields.read_splats(command.file, skip_nan=command.skip_nan)
     inside = splats.inside(command.box, command.sphere)
@@ -247,7 +247,7 @@ def build(command: BuildObject) -> None:
     parts = scene_file.parts_of(sources)
     for source in [Path(part.name) for part in parts] or sources:
         check_output(output, source)
-    progress = Progress()
+    progress = ProgressLine()
     progress("reading the field", 0.0)
     if parts:
         made = scene_file.build_parts(parts, options, dashes="--", progress=progress)
@@ -274,7 +274,7 @@ def inspect(command: Inspect) -> None:
             raise ValueError(f"--png draws neural objects only, got the robot {path}")
         return _inspect_robot(path, as_json=command.json)
     picture = picture_of(command, path.with_suffix(".png"), path)
-    progress = Progress()
+    progress = ProgressLine()
     made = scene_file.load_object(path, progress=progress)
     progress.close()
     report = describe(made, path)

@@ -10,9 +10,9 @@ from dano.cli._arguments import (
     BuildObject,
     Compare,
     Export,
+    FindPoses,
     Import,
-    Plan,
-    Poses,
+    PlanTask,
     Simulate,
     Train,
     UNNAMED,
@@ -29,7 +29,7 @@ _NAMED_AFTER: dict[type, tuple[str, str]] = {
     Import: ("file", ".grid.npz"),
     Simulate: ("scene", "_run.npz"),
     Track: ("video", "_motion.npz"),
-    Plan: ("task", "_plan.npz"),
+    PlanTask: ("task", "_plan.npz"),
     Export: ("object", "_export"),
     Compare: ("object", "_meshes.html"),
 }
@@ -48,7 +48,7 @@ def named(command: Any) -> tuple[Any, str | None]:
     fields: Any = command
     if isinstance(command, Simulate) and command.beside is not None:
         return dataclasses.replace(command, output=Path()), None
-    if isinstance(command, Poses):
+    if isinstance(command, FindPoses):
         source = command.images
         folder = source.parent if source.name == "images" else source
         usual = folder / "transforms.json" if source.is_dir() else Path(f"{_stem(source)}_transforms.json")

@@ -15,7 +15,7 @@ from dano.archive import checked_input, format_of, is_own, replacing, TRAJECTORY
 from dano.checks import checked_number
 from dano.cli import running
 from dano.cli._arguments import Demo, Simulate, View
-from dano.cli._console import Progress, put, put_json, say
+from dano.cli._console import ProgressLine, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures, run_files
 from dano.engine import simulate as simulate_scene
 from dano.fields import FIELD_FORMATS, FIELD_SUFFIXES, is_splats, load_field, read_splats
@@ -151,7 +151,7 @@ def _kind(path: Path) -> str:
 
 def _view_run(command: View) -> None:
     """A run; scenes and objects are simulated first."""
-    progress = Progress()
+    progress = ProgressLine()
     again = None
     if command.source.suffix.lower() in (".toml", ".dano") or scene_file.is_shipped(command.source):
         loaded = load(command.source, None, None)
@@ -310,7 +310,7 @@ class _Artist:
     def __init__(self, *, draws: bool, draft: bool, tell: Callable[[str], None]):
         self._draws, self._draft, self._say = draws, draft, tell
         self._thread = ThreadPoolExecutor(1, "dano artist")
-        self._progress = Progress()
+        self._progress = ProgressLine()
         self._orders: list[Future[None]] = []
         self._drawn: set[Path] = set()
         self._watched, self._stopped = threading.Event(), threading.Event()
@@ -387,7 +387,7 @@ def _draw_start(loaded: scene_file.SceneFile, path: Path) -> None:
 
 def load(path: Path, steps: int | None, timestep: float | None) -> scene_file.SceneFile:
     """The scene in a file, or that of an object dropped onto a floor."""
-    progress = Progress()
+    progress = ProgressLine()
     if path.suffix.lower() != ".toml":
         text = scene_file.drop_scene(path, progress=progress)
         where = path.with_suffix(".toml")
@@ -421,7 +421,7 @@ def _draw(loaded: list[scene_file.SceneFile], trajectories: list[Trajectory], co
     """A film of one run, or of two side by side."""
     from dano.report import render_side_by_side, render_trajectory, VideoOptions
 
-    progress = Progress()
+    progress = ProgressLine()
     film = VideoOptions(
         size=command.size,
         draft=command.draft,
@@ -449,7 +449,7 @@ def _simulated(
     resume: bool = False,
 ) -> tuple[running.Rollout, dict[str, Any]]:
     """Simulate and save; the rollout, and what came out in numbers."""
-    progress = Progress()
+    progress = ProgressLine()
     rollout = running.roll_out(loaded, progress, clock, kept, resume=resume)
     clock("writing")
     scene_file.save_run(output, rollout.trajectory, loaded)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dano.checks import checked_count, checked_items, checked_kind, checked_optional
+from dano.checks import checked_count, checked_items, checked_kind, checked_optional, checked_progress
 from dano.comparison._bodies import (
     best_level,
     Drop,
@@ -34,6 +34,7 @@ from dano.exchange import convex_hull, enclosed, Moments, signed_distances, soli
 from dano.extras import is_installed
 from dano.fields import AbstractField, AbstractShape, bake, GridField
 from dano.objects import NeuralObject, node_values
+from dano.progress import Progress
 
 TIMESTEP = 0.002
 """Of all engines [s]."""
@@ -55,96 +56,58 @@ _RESOLUTION = 96
 
 
 class Row(NamedTuple):
-    """One way to simulate the object, measured. Shares and errors are 1, not per cent; NaN: not measured.
+    """One way to simulate the object, measured. Shares and errors are 1, not per cent; NaN: not measured."""
 
-    Attributes:
-        route: What was made of the object.
-        engine: Where it was simulated.
-        level: Density of the surface; NaN for the object itself.
-        preparation: Time for surface, pieces and loading [s].
-        triangles: Of the surface.
-        pieces: Convex pieces that touch; 0 where contact is not with pieces.
-        parts: Connected parts of the surface.
-        open_edges: Edges without two faces; 0: watertight.
-        volume_error: Relative.
-        com_error: Distance over the size.
-        inertia_error: Largest difference of a principal moment, relative.
-        tilt: Largest angle between a rest and the nearest stable pose of the reference [°]; of the object as
-            reference, of its mesh or of its samples.
-        gap: Of all rests, the height of the reference's lowest point over the floor that is largest in size,
-            over the size of the reference; negative: below the floor.
-        phantom: Share of clear probes that touch.
-        phantom_gap: Largest clearance of one of them, over the size.
-        missed: Share of probes inside that do not touch.
-        step_time: At rest [s].
-        motion_error: Largest distance between the same point of it and of the truth soon after the first
-            contact, over the size; mean over the drops.
-        moving: Largest speed at the end, over √(size · g).
-        note: What else there is to say.
-    """
-
-    route: str
-    engine: str
-    level: float = math.nan
-    preparation: float = math.nan
-    triangles: int = 0
-    pieces: int = 0
-    parts: int = 0
-    open_edges: int = 0
-    volume_error: float = math.nan
-    com_error: float = math.nan
-    inertia_error: float = math.nan
+    route: str  # What was made of the object
+    engine: str  # Where it was simulated
+    level: float = math.nan  # Density of the surface; NaN for the object itself
+    preparation: float = math.nan  # Time for surface, pieces and loading [s]
+    triangles: int = 0  # Of the surface
+    pieces: int = 0  # Convex pieces that touch; 0 where contact is not with pieces
+    parts: int = 0  # Connected parts of the surface
+    open_edges: int = 0  # Edges without two faces; 0: watertight
+    volume_error: float = math.nan  # Relative
+    com_error: float = math.nan  # Distance over the size
+    inertia_error: float = math.nan  # Largest difference of a principal moment, relative
+    # Largest angle between a rest and the nearest stable pose of the reference [°]; of the object as
+    # reference, of its mesh or of its samples.
     tilt: float = math.nan
+    # Of all rests, the height of the reference's lowest point over the floor that is largest in size, over
+    # the size of the reference; negative: below the floor.
     gap: float = math.nan
-    phantom: float = math.nan
-    phantom_gap: float = math.nan
-    missed: float = math.nan
-    step_time: float = math.nan
+    phantom: float = math.nan  # Share of clear probes that touch
+    phantom_gap: float = math.nan  # Largest clearance of one of them, over the size
+    missed: float = math.nan  # Share of probes inside that do not touch
+    step_time: float = math.nan  # At rest [s]
+    # Largest distance between the same point of it and of the truth soon after the first contact, over the
+    # size; mean over the drops.
     motion_error: float = math.nan
-    moving: float = math.nan
-    note: str = ""
+    moving: float = math.nan  # Largest speed at the end, over √(size · g)
+    note: str = ""  # What else there is to say
 
 
 class Scenery(NamedTuple):
-    """What is drawn of a row: the first drop at rest.
+    """What is drawn of a row: the first drop at rest."""
 
-    Attributes:
-        row: Which.
-        meshes: What touches, or the surface where that is the object itself [m, F].
-        surface: Level surface that the pieces stand for [m, F].
-        rotation: F → W at the end, shape (3, 3).
-        origin: Of F at the end [m, W], shape (3,).
-    """
-
-    row: Row
-    meshes: list[Triangles]
-    surface: Triangles
-    rotation: Float[np.ndarray, "3 3"]
-    origin: Float[np.ndarray, "3"]
+    row: Row  # Which
+    meshes: list[Triangles]  # What touches, or the surface where that is the object itself [m, F]
+    surface: Triangles  # Level surface that the pieces stand for [m, F]
+    rotation: Float[np.ndarray, "3 3"]  # F → W at the end, shape (3, 3)
+    origin: Float[np.ndarray, "3"]  # Of F at the end [m, W], shape (3,)
 
 
 class Comparison(NamedTuple):
-    """What `compare` found.
+    """What `compare` found."""
 
-    Attributes:
-        rows: The object itself first.
-        scenery: What to draw of them, in the same order; without those that could not be simulated.
-        reference: What errors are measured against: "the truth" or "the neural object".
-        size: Of the reference [m].
-        levels: Densities that were tried.
-        best: The one whose cleaned surface has the volume of the reference.
-        drops: Number of drops.
-        missing: Sentences on what is not installed.
-    """
-
-    rows: list[Row]
+    rows: list[Row]  # The object itself first
+    # What to draw of them, in the same order; without those that could not be simulated.
     scenery: list[Scenery]
-    reference: str
-    size: float
-    levels: list[float]
-    best: float
-    drops: int
-    missing: list[str]
+    reference: str  # What errors are measured against: "the truth" or "the neural object"
+    size: float  # Of the reference [m]
+    levels: list[float]  # Densities that were tried
+    best: float  # The one whose cleaned surface has the volume of the reference
+    drops: int  # Number of drops
+    missing: list[str]  # Sentences on what is not installed
 
 
 _Engine = Own | MuJoCo | PyBullet
@@ -172,7 +135,7 @@ def compare(
     drops: int = 3,
     decomposed: bool = True,
     seed: int = 0,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Comparison:
     """Measure the mesh route against the neural object itself.
 
@@ -212,7 +175,7 @@ def compare(
     grid = _grid(thing.grid if field is None else field)
     top = float(grid.values.max())
     chosen = _checked_levels(thing, levels, top)
-    say = progress or (lambda description, share: None)
+    say = checked_progress(progress)
     say("reference", 0.0)
     bench = _bench(thing, truth, drops, seed)
     best = best_level(grid, bench.solid.moments.volume)

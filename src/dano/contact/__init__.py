@@ -12,7 +12,7 @@ from dano.contact._distributed import (
     CHUNK as CHUNK,
     combined as combined,
     DistributedLaw as DistributedLaw,
-    Material as Material,
+    Materials as Materials,
     materials as materials,
 )
 from dano.contact._laws import (

@@ -22,21 +22,15 @@ class SampleSet(eqx.Module):
 
     Samples are ordered so that each run of `BLOCK` is compact in space; the last run is filled up with copies
     of weight zero.
-
-    Attributes:
-        points: Homogeneous coordinates (x, y, z, 1) [m, F], shape (4, n); rows are contiguous.
-        products: x̃_j x̃_k of the homogeneous coordinates for j ≤ k, shape (10, n): what derivatives sum
-            over.
-        weights: φ_i / Σφ, shape (n,); they sum to one.
-        centers: Centre of each block [m, F], shape (n / BLOCK, 3).
-        radii: Radius of each block about its centre [m], shape (n / BLOCK,).
     """
 
+    # Homogeneous coordinates (x, y, z, 1) [m, F], shape (4, n); rows are contiguous.
     points: Float[Array, "4 n"]
+    # x̃_j x̃_k of the homogeneous coordinates for j ≤ k, shape (10, n): what derivatives sum over.
     products: Float[Array, "10 n"]
-    weights: Float[Array, " n"]
-    centers: Float[Array, "blocks 3"]
-    radii: Float[Array, " blocks"]
+    weights: Float[Array, " n"]  # φ_i / Σφ, shape (n,); they sum to one
+    centers: Float[Array, "blocks 3"]  # Centre of each block [m, F], shape (n / BLOCK, 3)
+    radii: Float[Array, " blocks"]  # Radius of each block about its centre [m], shape (n / BLOCK,)
 
     @classmethod
     def create(cls, points: Numbers, density: Numbers) -> "SampleSet":
@@ -53,21 +47,15 @@ class SampleSet(eqx.Module):
 
 
 class SurfaceSet(eqx.Module):
-    """Surface samples in the field frame, in blocks that are compact in space, as in `SampleSet`.
+    """Surface samples in the field frame, in blocks that are compact in space, as in `SampleSet`."""
 
-    Attributes:
-        points: Homogeneous coordinates (x, y, z, 1) [m, F], shape (4, n).
-        vectors: Vector area of each [m², F], zero for what fills up the last block, shape (3, n).
-        centers: Centre of each block [m, F], shape (n / BLOCK, 3).
-        radii: Radius of each block about its centre [m], shape (n / BLOCK,).
-        turning: How samples turn with the body (static): "fixed" to it; about its z "axis" they keep facing
-            the other body; of a "ball" all do, and `points` are directions on the unit ball.
-    """
-
-    points: Float[AnyArray, "4 n"]
+    points: Float[AnyArray, "4 n"]  # Homogeneous coordinates (x, y, z, 1) [m, F], shape (4, n)
+    # Vector area of each [m², F], zero for what fills up the last block, shape (3, n).
     vectors: Float[AnyArray, "3 n"]
-    centers: Float[AnyArray, "blocks 3"]
-    radii: Float[AnyArray, " blocks"]
+    centers: Float[AnyArray, "blocks 3"]  # Centre of each block [m, F], shape (n / BLOCK, 3)
+    radii: Float[AnyArray, " blocks"]  # Radius of each block about its centre [m], shape (n / BLOCK,)
+    # How samples turn with the body (static): "fixed" to it; about its z "axis" they keep facing the other
+    # body; of a "ball" all do, and `points` are directions on the unit ball.
     turning: str = eqx.field(static=True, default="fixed")
 
     @classmethod
@@ -86,17 +74,12 @@ class SurfaceSet(eqx.Module):
 
 
 class Support(eqx.Module):
-    """Distance to where a grid's density is not zero, rounded down: says which blocks of samples to skip.
+    """Distance to where a grid's density is not zero, rounded down: says which blocks of samples to skip."""
 
-    Attributes:
-        distance: Lower bound on the distance [m] from each node to the support, shape (nx, ny, nz).
-        origin: First node [m, F], shape (3,).
-        spacing: Distance between nodes [m], shape (3,).
-    """
-
+    # Lower bound on the distance [m] from each node to the support, shape (nx, ny, nz).
     distance: Float[Array, "nx ny nz"]
-    origin: Float[Array, "3"]
-    spacing: Float[Array, "3"]
+    origin: Float[Array, "3"]  # First node [m, F], shape (3,)
+    spacing: Float[Array, "3"]  # Distance between nodes [m], shape (3,)
 
     @classmethod
     def create(cls, field: GridField) -> "Support":

@@ -50,19 +50,13 @@ _FLAT = 1e-3
 
 
 class Distance(NamedTuple):
-    """Between two solids; see `distance`.
+    """Between two solids; see `distance`."""
 
-    Attributes:
-        value: Signed distance [m]; negative: by how much they overlap.
-        point_a: The point of a's surface that is nearest to b, or deepest in it [m, W], shape (3,).
-        point_b: That of b.
-        normal: Unit vector from b to a [W]: moving a along it by δ raises the distance by δ.
-    """
-
-    value: Float[Array, ""]
+    value: Float[Array, ""]  # Signed distance [m]; negative: by how much they overlap
+    # The point of a's surface that is nearest to b, or deepest in it [m, W], shape (3,).
     point_a: Float[Array, "3"]
-    point_b: Float[Array, "3"]
-    normal: Float[Array, "3"]
+    point_b: Float[Array, "3"]  # That of b
+    normal: Float[Array, "3"]  # Unit vector from b to a [W]: moving a along it by δ raises the distance by δ
 
 
 def distance(

@@ -35,40 +35,24 @@ _SHARP_SINKING, _FIXED_SINKING, _SHARP_DEPTH = 1e-4, 1e-5, 2e-4
 _SLOW = 0.2
 
 
-class Material(NamedTuple):
-    """What the traction at a point depends on besides geometry and velocity; arrays over contacts.
+class Materials(NamedTuple):
+    """What the traction at a point depends on besides geometry and velocity; arrays over contacts."""
 
-    Attributes:
-        stiffness: k [Pa/m].
-        restitution: e [1].
-        restitution_velocity: v_e [m/s].
-        hysteresis: σ [1].
-        friction: μ [1].
-        friction_fading: φ [1].
-        friction_pressure: p₀ [Pa].
-        stiction: v_s [m/s].
-        ahead: θ h, how far ahead the depth is taken [s].
-        timestep: h [s].
-        instant: 1 where impacts end within the step, 0 where they are left to the spring.
-        bounce: Slowest rebound of an impact [m/s].
-        uplift: An overlap of depth d separates at most at √(uplift · d), if that exceeds v_e [m/s²].
-        gradual: v_g [m/s].
-    """
-
-    stiffness: Float[Array, " *n"]
-    restitution: Float[Array, " *n"]
-    restitution_velocity: Float[Array, " *n"]
-    hysteresis: Float[Array, " *n"]
-    friction: Float[Array, " *n"]
-    friction_fading: Float[Array, " *n"]
-    friction_pressure: Float[Array, " *n"]
-    stiction: Float[Array, " *n"]
-    ahead: Float[Array, " *n"]
-    timestep: Float[Array, " *n"]
-    instant: Float[Array, " *n"]
-    bounce: Float[Array, " *n"]
+    stiffness: Float[Array, " *n"]  # k [Pa/m]
+    restitution: Float[Array, " *n"]  # e [1]
+    restitution_velocity: Float[Array, " *n"]  # v_e [m/s]
+    hysteresis: Float[Array, " *n"]  # σ [1]
+    friction: Float[Array, " *n"]  # μ [1]
+    friction_fading: Float[Array, " *n"]  # φ [1]
+    friction_pressure: Float[Array, " *n"]  # p₀ [Pa]
+    stiction: Float[Array, " *n"]  # v_s [m/s]
+    ahead: Float[Array, " *n"]  # θ h, how far ahead the depth is taken [s]
+    timestep: Float[Array, " *n"]  # h [s]
+    instant: Float[Array, " *n"]  # 1 where impacts end within the step, 0 where they are left to the spring
+    bounce: Float[Array, " *n"]  # Slowest rebound of an impact [m/s]
+    # An overlap of depth d separates at most at √(uplift · d), if that exceeds v_e [m/s²].
     uplift: Float[Array, " *n"]
-    gradual: Float[Array, " *n"]
+    gradual: Float[Array, " *n"]  # v_g [m/s]
 
 
 class DistributedLaw(AbstractContactLaw):
@@ -220,7 +204,7 @@ def materials(
     groups: Sequence[tuple[DistributedLaw, ContactParams]],
     timestep: Float[AnyArray, ""],
     gravity: Float[AnyArray, ""],
-) -> Material:
+) -> Materials:
     """What points of contacts feel, as arrays over all contacts.
 
     Args:
@@ -241,7 +225,7 @@ def materials(
     strength = xp.where(gravity > 0, gravity, STANDARD_GRAVITY)
     # Sinking from rest by half the depth of an impact makes no impact.
     settling = xp.where(gravity > 0, xp.sqrt(strength * stacked.impact_depth), 0)
-    return Material(
+    return Materials(
         stacked.stiffness,
         stacked.restitution,
         stacked.restitution_velocity,

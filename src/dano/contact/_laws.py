@@ -149,25 +149,17 @@ STANDARD_GRAVITY = 9.81
 
 
 class Setting(NamedTuple):
-    """What default parameters are derived from.
+    """What default parameters are derived from."""
 
-    Attributes:
-        size: Largest extent of the smaller body [m]; an array of those of many bodies that are completed
-            at once.
-        gravity: Its magnitude, 9.81 where there is none [m/s²].
-        stiffness: Gives the stiffness [Pa/m] at which either body, set down on a rigid floor in a typical
-            orientation, sinks by at most a share of its size.
-        timestep: h [s].
-        sharp: Whether edges and faces of both bodies are known exactly.
-        on_fixed: Whether both are shapes, and one is fixed.
-    """
-
+    # Largest extent of the smaller body [m]; an array of those of many bodies that are completed at once.
     size: float | Float[np.ndarray, " n"]
-    gravity: Float[Array, ""]
+    gravity: Float[Array, ""]  # Its magnitude, 9.81 where there is none [m/s²]
+    # Gives the stiffness [Pa/m] at which either body, set down on a rigid floor in a typical orientation,
+    # sinks by at most a share of its size.
     stiffness: Callable[[float], AnyArray]
-    timestep: Float[Array, ""]
-    sharp: bool
-    on_fixed: bool
+    timestep: Float[Array, ""]  # h [s]
+    sharp: bool  # Whether edges and faces of both bodies are known exactly
+    on_fixed: bool  # Whether both are shapes, and one is fixed
 
 
 class AbstractContactLaw(eqx.Module):

@@ -22,17 +22,11 @@ from dano.maths import contract, einsum, matmul, matvec, product, safe_normalize
 
 
 class Patch(eqx.Module):
-    """Overlap of two colliders.
+    """Overlap of two colliders."""
 
-    Attributes:
-        overlap: ψ, the sampled mass inside the other body [kg], shape ().
-        centroid: χ, its centroid [m, W], shape (3,).
-        normal: n, unit vector from the second collider (B) to the first (A) [W], shape (3,).
-    """
-
-    overlap: Float[Array, ""]
-    centroid: Float[Array, "3"]
-    normal: Float[Array, "3"]
+    overlap: Float[Array, ""]  # ψ, the sampled mass inside the other body [kg], shape ()
+    centroid: Float[Array, "3"]  # χ, its centroid [m, W], shape (3,)
+    normal: Float[Array, "3"]  # n, unit vector from the second collider (B) to the first (A) [W], shape (3,)
 
     @property
     def point(self) -> Float[Array, "3"]:

@@ -14,37 +14,24 @@ from dano.scene import offer, Scene, State, Trajectory
 
 
 class ContactHistory(NamedTuple):
-    """What every pair of bodies of `Scene.pairs` did in every step of a trajectory.
+    """What every pair of bodies of `Scene.pairs` did in every step of a trajectory."""
 
-    Attributes:
-        points: Centroids of the overlaps [m, W] at the starts of the steps, (steps, pairs, 3).
-        overlaps: Overlaps there, (steps, pairs): a volume [m³], or ψ [kg] of the centroid law.
-        forces: On the first body of each pair [N, W], (steps, pairs, 3).
-    """
-
+    # Centroids of the overlaps [m, W] at the starts of the steps, (steps, pairs, 3).
     points: Float[np.ndarray, "steps pairs 3"]
+    # Overlaps there, (steps, pairs): a volume [m³], or ψ [kg] of the centroid law.
     overlaps: Float[np.ndarray, "steps pairs"]
-    forces: Float[np.ndarray, "steps pairs 3"]
+    forces: Float[np.ndarray, "steps pairs 3"]  # On the first body of each pair [N, W], (steps, pairs, 3)
 
 
 class Touch(NamedTuple):
-    """One contact of two bodies, from its first step with a force to its last.
+    """One contact of two bodies, from its first step with a force to its last."""
 
-    Attributes:
-        a: The one body.
-        b: The other.
-        start: When its first step begins [s].
-        end: When its last step ends [s].
-        peak: Largest force of a step [N].
-        impulse: Sum over its steps on `a` from `b` [N s, W], shape (3,).
-    """
-
-    a: str
-    b: str
-    start: float
-    end: float
-    peak: float
-    impulse: Float[np.ndarray, "3"]
+    a: str  # The one body
+    b: str  # The other
+    start: float  # When its first step begins [s]
+    end: float  # When its last step ends [s]
+    peak: float  # Largest force of a step [N]
+    impulse: Float[np.ndarray, "3"]  # Sum over its steps on `a` from `b` [N s, W], shape (3,)
 
 
 def contact_history(scene: Scene, states: State, *, engine: AbstractEngine | None = None) -> ContactHistory:

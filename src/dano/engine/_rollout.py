@@ -78,20 +78,16 @@ class AbstractEngine(eqx.Module):
 
 
 class VariationalEngine(AbstractEngine):
-    """The variational integrator with an implicit solve per step (see `dano.engine._variational`).
+    """The variational integrator with an implicit solve per step (see `dano.engine._variational`)."""
 
-    Attributes:
-        tolerance: A step is solved when no component of its residual, divided by mass or inertia, exceeds
-            this times (1 + its largest velocity) [m/s, rad/s]; default: the dtype's resolution to the power
-            3/4 (2e-12, 6e-6).
-        max_iterations: Newton and line search passes after which a step is reported as not converged.
-        capacity: Chunks of 16 point contacts that a step has room for. A step with more is reported as not
-            converged. Default: by the bodies; and where `dano.step` and `dano.simulate` find more, they
-            compile and run again with room for all (outside of `jax.jit`).
-    """
-
+    # A step is solved when no component of its residual, divided by mass or inertia, exceeds this times (1 +
+    # its largest velocity) [m/s, rad/s]; default: the dtype's resolution to the power 3/4 (2e-12, 6e-6).
     tolerance: float | None = eqx.field(static=True, default=None)
+    # Newton and line search passes after which a step is reported as not converged.
     max_iterations: int = eqx.field(static=True, default=500)
+    # Chunks of 16 point contacts that a step has room for. A step with more is reported as not converged.
+    # Default: by the bodies; and where `dano.step` and `dano.simulate` find more, they compile and run again
+    # with room for all (outside of `jax.jit`).
     capacity: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):

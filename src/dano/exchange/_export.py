@@ -32,6 +32,7 @@ from dano.exchange._wavefront import write_image, write_material, write_obj
 from dano.fields import Splats
 from dano.memory import check_nodes
 from dano.objects import NeuralObject
+from dano.progress import Progress
 
 if TYPE_CHECKING:
     from dano.vision import LearnedField
@@ -61,25 +62,15 @@ _BYTES_PER_NODE = 400
 
 
 class Exported(NamedTuple):
-    """What was written.
+    """What was written."""
 
-    Attributes:
-        folder: Where.
-        files: Names in the folder, sorted.
-        collision: How contact is represented, "coacd" or "hull".
-        pieces: Number of convex pieces.
-        triangles: Number of visible triangles.
-        textured: Whether the colours were known.
-        notes: Sentences on what the formats cannot hold.
-    """
-
-    folder: Path
-    files: list[str]
-    collision: str
-    pieces: int
-    triangles: int
-    textured: bool
-    notes: list[str]
+    folder: Path  # Where
+    files: list[str]  # Names in the folder, sorted
+    collision: str  # How contact is represented, "coacd" or "hull"
+    pieces: int  # Number of convex pieces
+    triangles: int  # Number of visible triangles
+    textured: bool  # Whether the colours were known
+    notes: list[str]  # Sentences on what the formats cannot hold
 
 
 def export_object(
@@ -96,7 +87,7 @@ def export_object(
     max_pieces: int | None = None,
     resolution: int = 64,
     texture_size: int = 1024,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Exported:
     """Write an object as a folder of files that other simulators load.
 
@@ -136,33 +127,19 @@ def export_object(
     formats = _checked_formats(to)
     name = _checked_name(_default_name(target) if name is None else name)
     contact = checks.checked_optional("contact", contact, ContactParams) or ContactParams()
-    splats, learned = (look, None) if isinstance(look, Splats) else (None, look)
-    if learned is not None and not hasattr(learned, "model"):
-        raise ValueError(
-            f"look must be a dano.vision.LearnedField or dano.fields.Splats, got {type(look).__name__}"
-        )
-    checks.checked_optional("surroundings", surroundings, Splats)
-    if progress is not None:
-        checks.checked_function("progress", progress)
-    how = chosen_collision(collision)
+    splats, learned = _checked_look(look, surroundings)
+    say = checks.checked_progress(progress)
+    how = chosen_collision(collision, solid=obj.solid is not None)
     _check_numbers(concavity, max_pieces, resolution, texture_size)
     check_folder(target)
-    if "usd" in formats:
-        _usd.check_usd()
-    say = progress or (lambda description, share: None)
     say("surface", 0.0)
     mesh, normals, coarse = _surfaces(obj, resolution)
     say("convex pieces", 0.1)
-    if how == "hull" or obj.solid is None:
-        how, pieces = "hull", [convex_hull(mesh.vertices)]
-    else:
-        pieces = decomposition(coarse, concavity, max_pieces)
+    pieces = [convex_hull(mesh.vertices)] if how == "hull" else decomposition(coarse, concavity, max_pieces)
     say("colours", 0.6)
+    com, inertia = (np.asarray(each, np.float64) for each in (obj.mass.com, obj.mass.inertia))
     contents = Contents(
-        name=name,
-        mass=float(obj.mass.mass),
-        com=np.asarray(obj.mass.com, np.float64),
-        inertia=np.asarray(obj.mass.inertia, np.float64),
+        *(name, float(obj.mass.mass), com, inertia),
         mesh=mesh,
         resolution=resolution,
         normals=normals,
@@ -176,6 +153,18 @@ def export_object(
     exported = _written(target, obj, contents, formats, how)
     say("done", 1.0)
     return exported
+
+
+def _checked_look(look: Any, surroundings: Any) -> tuple[Splats | None, "LearnedField | None"]:
+    """Splats, or what photographs have taught."""
+    checks.checked_optional("surroundings", surroundings, Splats)
+    if isinstance(look, Splats):
+        return look, None
+    if look is not None and not hasattr(look, "model"):
+        raise ValueError(
+            f"look must be a dano.vision.LearnedField or dano.fields.Splats, got {type(look).__name__}"
+        )
+    return None, look
 
 
 def _surfaces(obj: NeuralObject, resolution: int) -> tuple[Triangles, np.ndarray, Triangles]:
@@ -197,6 +186,8 @@ def _checked_formats(to: str | Sequence[str]) -> list[str]:
         checks.checked_choice("to", form, get_args(Format))
     if not formats:
         raise ValueError(f"to must name at least one of {list(get_args(Format))}, got none")
+    if "usd" in formats:
+        _usd.check_usd()
     return list(dict.fromkeys(formats))
 
 

@@ -35,15 +35,10 @@ _AT_ONCE = 1 << 16
 
 
 class Triangles(NamedTuple):
-    """A triangle mesh.
+    """A triangle mesh."""
 
-    Attributes:
-        vertices: [m, F], shape (v, 3).
-        faces: Rows of `vertices`, counter-clockwise seen from outside, shape (f, 3).
-    """
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices: Float[np.ndarray, "v 3"]  # [m, F], shape (v, 3)
+    faces: Int[np.ndarray, "f 3"]  # Rows of `vertices`, counter-clockwise seen from outside, shape (f, 3)
 
     @property
     def corners(self) -> Float[np.ndarray, "f 3 3"]:
@@ -80,17 +75,11 @@ class Triangles(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """What a homogeneous solid of unit density has.
+    """What a homogeneous solid of unit density has."""
 
-    Attributes:
-        volume: [m³].
-        com: Centroid [m, F], shape (3,).
-        inertia: ∫ (|r|² I − r rᵀ) dV about the centroid [m⁵], shape (3, 3).
-    """
-
-    volume: float
-    com: Float[np.ndarray, "3"]
-    inertia: Float[np.ndarray, "3 3"]
+    volume: float  # [m³]
+    com: Float[np.ndarray, "3"]  # Centroid [m, F], shape (3,)
+    inertia: Float[np.ndarray, "3 3"]  # ∫ (|r|² I − r rᵀ) dV about the centroid [m⁵], shape (3, 3)
 
 
 def enclosed(mesh: Triangles) -> Moments:
@@ -244,8 +233,8 @@ def _igl() -> Any:
 Collision = Literal["auto", "coacd", "hull"]
 
 
-def chosen_collision(collision: str) -> Literal["coacd", "hull"]:
-    """What is made for `collision`: "auto" is CoACD where it is installed.
+def chosen_collision(collision: str, *, solid: bool) -> Literal["coacd", "hull"]:
+    """What is made for `collision`: "auto" is CoACD where it is installed; the hull of what is no solid.
 
     Raises:
         ValueError: If it is not one of the three.
@@ -256,7 +245,7 @@ def chosen_collision(collision: str) -> Literal["coacd", "hull"]:
     installed = is_installed("coacd")
     if collision == "coacd" and not installed:
         load_coacd()
-    return "hull" if collision == "hull" or not installed else "coacd"
+    return "coacd" if collision != "hull" and installed and solid else "hull"
 
 
 def convex_hull(points: Float[np.ndarray, "n 3"]) -> Triangles:

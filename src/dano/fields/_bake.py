@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dano.checks import checked_count, checked_function, checked_kind
+from dano.checks import checked_count, checked_kind, checked_progress
 from dano.fields._base import AbstractField
 from dano.fields._grid import degree_of, GridField
 from dano.fields._host import density_at, host_jet
@@ -25,30 +25,20 @@ _N_TESTS = 20_000
 
 
 class BakeError(NamedTuple):
-    """How far a baked grid is from its field, at random points that are not nodes.
+    """How far a baked grid is from its field, at random points that are not nodes."""
 
-    Attributes:
-        rms: Root of the mean squared difference, as a fraction of the largest density of the field.
-        max: Largest difference, as a fraction of the largest density of the field.
-        mass: Difference of the integrals ∫φ dx, as a fraction of the field's, with its sign (positive: grid
-            too heavy).
-    """
-
-    rms: float
-    max: float
+    rms: float  # Root of the mean squared difference, as a fraction of the largest density of the field
+    max: float  # Largest difference, as a fraction of the largest density of the field
+    # Difference of the integrals ∫φ dx, as a fraction of the field's, with its sign (positive: grid too
+    # heavy).
     mass: float
 
 
 class Baked(NamedTuple):
-    """A grid and its error.
+    """A grid and its error."""
 
-    Attributes:
-        grid: The baked field.
-        error: Its deviation from the original.
-    """
-
-    grid: GridField
-    error: BakeError
+    grid: GridField  # The baked field
+    error: BakeError  # Its deviation from the original
 
 
 def bake(
@@ -85,8 +75,7 @@ def bake(
     resolution = checked_count("resolution", resolution, least=4, most=1024)
     batch_size = checked_count("batch_size", batch_size)
     key = checked_key(key)
-    if progress is not None:
-        checked_function("progress", progress)
+    say = checked_progress(progress)
     lower, upper = np.asarray(field.bounds, dtype=np.float64)
     if not np.all(np.isfinite([lower, upper])):
         raise ValueError(
@@ -102,8 +91,7 @@ def bake(
     n_nodes = int(np.prod(shape))
 
     def report(done: int) -> None:
-        if progress is not None:
-            progress("sampling the field", min(done / n_nodes, 1.0))
+        say("sampling the field", min(done / n_nodes, 1.0))
 
     def nodes(rows: np.ndarray) -> np.ndarray:
         return origin[:, None] + spacing * np.stack(np.unravel_index(rows, shape))

@@ -29,21 +29,14 @@ class CallableField(AbstractField):
     called on the host, once per batch (also under `jax.vmap`), which suits building objects and baking rather
     than simulation; bake them for that. PyTorch gradients come from its autograd; NumPy gradients are central
     differences of `step`.
-
-    Attributes:
-        module: The function if it is an `equinox.Module`, whose arrays are then leaves of this field; else
-            None.
-        function: Any other function (static).
-        box: Lower and upper corner [m, F]; the density is zero outside.
-        framework: "jax", "numpy" or "torch" (static).
-        step: Central-difference step [m] of NumPy gradients (static).
     """
 
+    # The function if it is an `equinox.Module`, whose arrays are then leaves of this field; else None.
     module: Any
-    function: Any = eqx.field(static=True)
-    box: Float[Array, "2 3"]
-    framework: Framework = eqx.field(static=True)
-    step: float = eqx.field(static=True)
+    function: Any = eqx.field(static=True)  # Any other function (static)
+    box: Float[Array, "2 3"]  # Lower and upper corner [m, F]; the density is zero outside
+    framework: Framework = eqx.field(static=True)  # "jax", "numpy" or "torch" (static)
+    step: float = eqx.field(static=True)  # Central-difference step [m] of NumPy gradients (static)
 
     def __init__(
         self,

@@ -133,15 +133,10 @@ def _posed_jet(jet_of: Callable[[Array, int], Jet], pose: Pose, x: Float[Array, 
 
 
 class PosedField(AbstractField):
-    """A field moved by a pose; see `posed`.
+    """A field moved by a pose; see `posed`."""
 
-    Attributes:
-        field: The field, in its own frame.
-        pose: Maps the frame of `field` into the frame of this field.
-    """
-
-    field: AbstractField
-    pose: Pose
+    field: AbstractField  # The field, in its own frame
+    pose: Pose  # Maps the frame of `field` into the frame of this field
 
     @property
     @one_program
@@ -231,15 +226,10 @@ def _scaled_jet(
 
 
 class ScaledField(AbstractField):
-    """A field enlarged about its origin; see `scaled`.
+    """A field enlarged about its origin; see `scaled`."""
 
-    Attributes:
-        field: The field, in its own units.
-        factor: Length in this field of a unit length of `field`.
-    """
-
-    field: AbstractField
-    factor: Float[Array, ""]
+    field: AbstractField  # The field, in its own units
+    factor: Float[Array, ""]  # Length in this field of a unit length of `field`
 
     @property
     @one_program
@@ -331,13 +321,9 @@ def _of_part(index: Int[Array, " n"], jets: list[Jet]) -> Jet:
 
 
 class UnionField(AbstractField):
-    """The largest density of several fields; see `union`.
+    """The largest density of several fields; see `union`."""
 
-    Attributes:
-        fields: The parts, all in the frame of this field.
-    """
-
-    fields: tuple[AbstractField, ...]
+    fields: tuple[AbstractField, ...]  # The parts, all in the frame of this field
 
     @property
     @one_program
@@ -364,13 +350,9 @@ class UnionField(AbstractField):
 
 
 class UnionShape(AbstractShape):
-    """The union of several shapes; see `union`.
+    """The union of several shapes; see `union`."""
 
-    Attributes:
-        shapes: The parts, all in the frame of this shape.
-    """
-
-    shapes: tuple[AbstractShape, ...]
+    shapes: tuple[AbstractShape, ...]  # The parts, all in the frame of this shape
     edge: Float[Array, ""] | None
 
     @property

@@ -319,17 +319,11 @@ def nonnegative_coefficients(samples: np.ndarray, degree: int) -> np.ndarray:
 
 
 class DensityMoments(NamedTuple):
-    """Moments of a density over all space.
+    """Moments of a density over all space."""
 
-    Attributes:
-        integral: M = ∫ φ dx [density · m³].
-        centroid: c = ∫ x φ dx / M [m, F], shape (3,).
-        second_moment: ∫ φ (x − c)(x − c)ᵀ dx [density · m⁵, axes of F], shape (3, 3).
-    """
-
-    integral: Float[Array, ""]
-    centroid: Float[Array, "3"]
-    second_moment: Float[Array, "3 3"]
+    integral: Float[Array, ""]  # M = ∫ φ dx [density · m³]
+    centroid: Float[Array, "3"]  # c = ∫ x φ dx / M [m, F], shape (3,)
+    second_moment: Float[Array, "3 3"]  # ∫ φ (x − c)(x − c)ᵀ dx [density · m⁵, axes of F], shape (3, 3)
 
 
 class GridField(AbstractField):
@@ -340,18 +334,13 @@ class GridField(AbstractField):
     coefficients c, so φ ≥ 0 and ∫φ dx = Σ c · (cell volume) hold exactly. Quadratic and cubic splines
     therefore smooth the values a little. `GridField.interpolating` passes through them instead. Beyond its
     outermost nodes the density falls to zero over 1, 1.5 or 2 cells and is zero from there on.
-
-    Attributes:
-        coefficients: The values with a border of zeros that makes queries fast; read `values` instead.
-        origin: Position [m, F] of node (0, 0, 0).
-        spacing: Distance [m] between nodes along each axis.
-        interpolation: "linear", "quadratic" or "cubic" (static).
     """
 
+    # The values with a border of zeros that makes queries fast; read `values` instead.
     coefficients: Float[Array, "px py pz"]
-    origin: Float[Array, "3"]
-    spacing: Float[Array, "3"]
-    interpolation: str = eqx.field(static=True)
+    origin: Float[Array, "3"]  # Position [m, F] of node (0, 0, 0)
+    spacing: Float[Array, "3"]  # Distance [m] between nodes along each axis
+    interpolation: str = eqx.field(static=True)  # "linear", "quadratic" or "cubic" (static)
     kind: ClassVar = "density"
 
     def __init__(self, values: Numbers, origin: Numbers, spacing: Numbers, interpolation: str = "quadratic"):

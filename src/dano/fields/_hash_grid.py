@@ -18,18 +18,13 @@ class HashGrid(eqx.Module):
     Two layouts exist. nerfstudio's own ("torch") hashes every level and puts node i of a level at
     x = i / scale. tiny-cuda-nn ("tcnn") stores levels that fit into the table densely, x fastest, and puts
     node i at (i − ½) / scale.
-
-    Attributes:
-        tables: Features of each level, shape (entries, features).
-        scales: Cells along an axis, one a level (static).
-        resolutions: Nodes along an axis of a dense level, 0 for a hashed one (static).
-        shift: Where x = 0 lies, in cells: 0 or ½ (static).
     """
 
-    tables: tuple[Float[Array, "_ features"], ...]
-    scales: tuple[float, ...] = eqx.field(static=True)
+    tables: tuple[Float[Array, "_ features"], ...]  # Features of each level, shape (entries, features)
+    scales: tuple[float, ...] = eqx.field(static=True)  # Cells along an axis, one a level (static)
+    # Nodes along an axis of a dense level, 0 for a hashed one (static).
     resolutions: tuple[int, ...] = eqx.field(static=True)
-    shift: float = eqx.field(static=True)
+    shift: float = eqx.field(static=True)  # Where x = 0 lies, in cells: 0 or ½ (static)
 
     @classmethod
     def create(

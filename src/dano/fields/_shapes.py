@@ -27,17 +27,11 @@ DEFAULT_EDGE = 0.005
 
 
 class SolidMoments(NamedTuple):
-    """Moments of the homogeneous solid that a shape encloses.
+    """Moments of the homogeneous solid that a shape encloses."""
 
-    Attributes:
-        volume: V = ∫ dx [m³].
-        centroid: c = ∫ x dx / V [m, F], shape (3,).
-        second_moment: ∫ (x − c)(x − c)ᵀ dx [m⁵, axes of F], shape (3, 3).
-    """
-
-    volume: Float[Array, ""]
-    centroid: Float[Array, "3"]
-    second_moment: Float[Array, "3 3"]
+    volume: Float[Array, ""]  # V = ∫ dx [m³]
+    centroid: Float[Array, "3"]  # c = ∫ x dx / V [m, F], shape (3,)
+    second_moment: Float[Array, "3 3"]  # ∫ (x − c)(x − c)ᵀ dx [m⁵, axes of F], shape (3, 3)
 
 
 def scaled_moments(moments: SolidMoments, factor: Float[Array, ""]) -> SolidMoments:

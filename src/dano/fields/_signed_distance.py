@@ -116,24 +116,15 @@ class SignedDistanceGrid(AbstractShape):
     Inside the grid the distance is the spline through the samples. Outside it is the distance at the closest
     point of the grid plus the distance to that point: continuous, growing in every direction, never below the
     true distance.
-
-    Attributes:
-        coefficients: Spline coefficients of the distance [m], with a border.
-        origin: Position [m, F] of node (0, 0, 0).
-        spacing: Distance [m] between nodes along each axis.
-        solid_bounds: Box [m, F] around the solid, to within one cell, shape (2, 3).
-        edge: Width [m] of the smooth edge, or None.
-        moments: Moments of the solid if known, else None.
-        interpolation: "linear", "quadratic" or "cubic" (static).
     """
 
-    coefficients: Float[Array, "px py pz"]
-    origin: Float[Array, "3"]
-    spacing: Float[Array, "3"]
-    solid_bounds: Float[Array, "2 3"]
-    edge: Float[Array, ""] | None
-    moments: SolidMoments | None
-    interpolation: str = eqx.field(static=True)
+    coefficients: Float[Array, "px py pz"]  # Spline coefficients of the distance [m], with a border
+    origin: Float[Array, "3"]  # Position [m, F] of node (0, 0, 0)
+    spacing: Float[Array, "3"]  # Distance [m] between nodes along each axis
+    solid_bounds: Float[Array, "2 3"]  # Box [m, F] around the solid, to within one cell, shape (2, 3)
+    edge: Float[Array, ""] | None  # Width [m] of the smooth edge, or None
+    moments: SolidMoments | None  # Moments of the solid if known, else None
+    interpolation: str = eqx.field(static=True)  # "linear", "quadratic" or "cubic" (static)
     kind: ClassVar = "grid"
 
     def __init__(

@@ -1,17 +1,18 @@
 """The verb: from observed motions to parameters, with error bars."""
 
 import dataclasses
+import functools
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from dano.checks import checked_function, checked_items, checked_kind, checked_optional
+from dano.checks import checked_items, checked_kind, checked_optional, checked_progress
 from dano.engine import AbstractEngine, checked_engine, held, Policy
 from dano.identification._checkpoint import digest_of, SearchCheckpoint
 from dano.identification._parameters import (
@@ -27,11 +28,12 @@ from dano.identification._residuals import Linearized, shifted, Smoothing
 from dano.identification._scales import check_scales
 from dano.identification._settings import deviations, estimated, IdentifyOptions, Setup
 from dano.identification._settling import ripple_covariance, worth_of
-from dano.identification._uncertainty import Errors, Identification, Minimum, scattered, uncertainty
-from dano.identification._windows import Plan
+from dano.identification._uncertainty import Errors, Fitted, Identification, Minimum, scattered, uncertainty
+from dano.identification._windows import WindowPlan
 from dano.identification.motions import joint_table, load_motion, Motion, QUANTITIES
 from dano.maths import quat_conjugate, quat_log, quat_multiply
 from dano.names import see
+from dano.progress import Progress
 from dano.scene import Control, Scene, State, Trajectory
 from dano.solvers import Solution, Stop
 
@@ -51,7 +53,7 @@ def identify(
     after: Identification | None = None,
     options: IdentifyOptions | None = None,
     engine: AbstractEngine | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Identification:
     """Find the parameters of a scene with which it moves as observed.
 
@@ -87,7 +89,8 @@ def identify(
         ValueError: If an argument is out of range, does not fit the others, or makes too much work.
     """
     controls = held(controls)
-    _check(scene, state, controls, progress)
+    tell = checked_progress(progress)
+    _check(scene, state, controls)
     options = checked_optional("options", options, IdentifyOptions) or IdentifyOptions()
     motions = _motions("observed", observed, scene, least=1)
     state = _started_in(scene, motions) if state is None else state
@@ -103,7 +106,7 @@ def identify(
     kept = _kept(setup, motions, state, after)
     beside = _motions("held_out", held_out, scene)
     try:
-        found = _fitted(setup, motions, beside, state, after, kept, progress)
+        found = _fitted(setup, motions, beside, state, after, kept, tell)
     except np.linalg.LinAlgError as error:
         raise ValueError(
             "observed must be motions that the scene can follow, got some from which the simulation ends in"
@@ -121,11 +124,10 @@ def _fitted(
     state: State | Sequence[State | None] | None,
     after: Identification | None,
     kept: SearchCheckpoint,
-    progress: Callable[[str, float], None] | None,
+    tell: Progress,
 ) -> Identification:
     """Searches from all starts, and measures the error on what is held out."""
     began = time.perf_counter()
-    tell = progress or (lambda description, share: None)
     problem = Problem(setup, motions, state)
     problem.check_groups(setup.options.independent)
     if after is not None:
@@ -183,7 +185,7 @@ class _Ended(NamedTuple):
 
 
 def _searched(
-    problem: Problem, options: IdentifyOptions, kept: SearchCheckpoint, tell: Callable[[str, float], None]
+    problem: Problem, options: IdentifyOptions, kept: SearchCheckpoint, tell: Progress
 ) -> list[_Ended]:
     """Where the search from each start ended, best first."""
     ended = []
@@ -233,16 +235,15 @@ def _identification(
     at_best = problem.simulate(best.x, best.blocks)
     at_start = problem.simulate(space.start, plan.start)
     known = np.asarray(at_best.lengths)
-    seen = known[known >= 0]
-    least = problem.least_variance
     independent = setup.options.independent
-    shared = (space, best.x, best.normal, seen, setup.options.huber, plan.n_data, scene, ripple, least)
-    sure = uncertainty(*shared, None if independent == "numbers" else problem.groups(at_best, independent))
+    fitted = Fitted(space, best.x, best.normal, known[known >= 0], plan.n_data, scene)
+    apart = functools.partial(uncertainty, fitted, setup.options.huber, ripple, problem.least_variance)
+    sure = apart(None if independent == "numbers" else problem.groups(at_best, independent))
     values, errors = values_at(space.selections, best.x, sure.covariance)
     fit_errors = _errors(plan, motions, at_best)
     messages = list(sure.messages)
     if independent == "numbers" and len(motions) > len(space.start) + 1:
-        between = uncertainty(*shared, problem.groups(at_best, "motions"))
+        between = apart(problem.groups(at_best, "motions"))
         messages += scattered(space.labels, sure.covariance, between.covariance, len(motions))
     if failed := int(np.sum(np.asarray(at_best.unconverged))):
         page = see("steps-did-not-converge")
@@ -321,7 +322,7 @@ def _started_in(scene: Scene, motions: Sequence[Motion]) -> State | None:
     return scene.initial_state()
 
 
-def _check(scene: Any, state: Any, controls: Any, progress: Any) -> None:
+def _check(scene: Any, state: Any, controls: Any) -> None:
     """Check the scene, initial states that were given, and what drives the motions.
 
     Shapes of controls are checked when they are cut to the motions.
@@ -333,11 +334,9 @@ def _check(scene: Any, state: Any, controls: Any, progress: Any) -> None:
     for one in _listed(controls):
         if one is not None and not callable(one):
             checked_kind("controls", one, Control)
-    if progress is not None:
-        checked_function("progress", progress)
 
 
-def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
+def _errors(plan: WindowPlan, motions: Sequence[Motion], found: Linearized) -> Errors:
     lengths = np.asarray(found.lengths)
     weights = {key: np.asarray(w) for key, w in plan.windows.weights.items()}
     means, finals = {}, {}
@@ -360,7 +359,7 @@ def _errors(plan: Plan, motions: Sequence[Motion], found: Linearized) -> Errors:
     return Errors(means["position"], finals["position"], means["orientation"], finals["orientation"], rms)
 
 
-def _away(plan: Plan, predicted: State, key: str) -> np.ndarray:
+def _away(plan: WindowPlan, predicted: State, key: str) -> np.ndarray:
     """By how much positions [m] or orientations [rad] are off, shape (windows, frames, bodies)."""
     here, seen = (
         np.asarray(getattr(s, key))[:, :, list(plan.bodies)] for s in (predicted, plan.windows.observed)
@@ -427,7 +426,9 @@ def _way(motions: Sequence[Motion]) -> float:
     return max(ways)
 
 
-def _as_motions(plan: Plan, motions: Sequence[Motion], found: Linearized, scene: Scene) -> tuple[Motion, ...]:
+def _as_motions(
+    plan: WindowPlan, motions: Sequence[Motion], found: Linearized, scene: Scene
+) -> tuple[Motion, ...]:
     """Predictions at the frames of each motion, of its bodies; NaN for frames before its first window."""
     predicted = {key: np.asarray(getattr(found.predicted, key)) for key in QUANTITIES}
     joints = found.predicted.q

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.engine import device_mesh
-from dano.identification._checkpoint import SearchCheckpoint
+from dano.identification._checkpoint import Keep, SearchCheckpoint
 from dano.identification._planes import Smoothing
 from dano.identification._residuals import (
     Linearized,
@@ -31,11 +31,43 @@ from dano.identification._uncertainty import Groups, Identification
 from dano.identification._windows import draw_velocities, plan_windows
 from dano.identification.motions import Motion, QUANTITIES
 from dano.scene import Control, Scene, State
-from dano.solvers import bounded_least_squares, eliminated, NormalEquations, Solution, Stop
+from dano.solvers import (
+    bounded_least_squares,
+    eliminated,
+    Iterate,
+    LeastSquaresOptions,
+    NormalEquations,
+    Solution,
+    Stop,
+)
 
 
-def chained(p, k, owner, jumps, loss, gradient, hessian, jump, slope) -> NormalEquations:
-    """Normal equations with one block for each motion, whose windows are tied by their jumps."""
+class _Local(NamedTuple):
+    """The first five of `Linearized`, as arrays of NumPy."""
+
+    loss: np.ndarray
+    gradient: np.ndarray
+    hessian: np.ndarray
+    jump: np.ndarray
+    slope: np.ndarray
+
+    @classmethod
+    def of(cls, found: Linearized) -> "_Local":
+        """Those of a simulation of all windows."""
+        return cls(*(np.asarray(v, float) for v in found[:5]))
+
+
+def chained(p: int, owner: np.ndarray, jumps: Array, local: _Local) -> NormalEquations:
+    """Normal equations with one block for each motion, whose windows are tied by their jumps.
+
+    Args:
+        p: Number of parameters; other unknowns are a window's own.
+        owner: Motion of each window.
+        jumps: Standard deviation of each number of a jump.
+        local: What was simulated.
+    """
+    loss, gradient, hessian, jump, slope = local
+    k = gradient.shape[1] - p
     counts = np.bincount(owner)
     size = int(counts.max()) * k
     place = np.concatenate([np.arange(n) for n in counts])
@@ -132,8 +164,7 @@ class Problem:
             controls=[None] * len(motions) if policy is not None else _control_list(scene, controls, motions),
             noise=noise,
             initial=initial,
-            window=options.window,
-            continuous=bool(self.ties),
+            options=options,
         )
         self.plan = self._planned()
         self.measured, self._near = True, False
@@ -267,23 +298,23 @@ class Problem:
 
     def assembled(self, found: Linearized) -> NormalEquations:
         """Normal equations of a simulation of all windows."""
-        return self._assembled(*(np.asarray(v, float) for v in found[:5]), owner=self.plan.owner)
+        return self._assembled(_Local.of(found), self.plan.owner)
 
     def groups(self, found: Linearized, independent: str | Sequence[str]) -> Groups:
         """What each independent group of a simulation says of the parameters; see `IdentifyOptions`."""
         labels = _labels(self, independent)
-        arrays = [np.asarray(v, float) for v in found[:5]]
-        parts = []
+        local, parts = _Local.of(found), []
         for label in np.unique(labels):
             mine = labels == label
             _, owner = np.unique(self.plan.owner[mine], return_inverse=True)
-            parts.append(eliminated(self._assembled(*(v[mine] for v in arrays), owner=owner)))
+            parts.append(eliminated(self._assembled(_Local(*(v[mine] for v in local)), owner)))
         return Groups(np.array([g for g, _ in parts]), np.array([h for _, h in parts]))
 
-    def _assembled(self, loss, gradient, hessian, jump, slope, *, owner: np.ndarray) -> NormalEquations:
+    def _assembled(self, local: _Local, owner: np.ndarray) -> NormalEquations:
         p, k = len(self.space.start), self.private
         if self.model.jumps is not None:
-            return chained(p, k, owner, self.model.jumps, loss, gradient, hessian, jump, slope)
+            return chained(p, owner, self.model.jumps, local)
+        loss, gradient, hessian, _, _ = local
         return NormalEquations(
             float(loss.sum()),
             gradient[:, :p].sum(axis=0),
@@ -354,24 +385,33 @@ class Problem:
         """
 
         def minimise(x, blocks, tolerance: float, held: bool = not free) -> Solution:
-            begun = functools.partial(
-                bounded_least_squares,
-                self.linearize,
-                x,
-                lower=x if held else self.space.lower,
-                upper=x if held else self.space.upper,
-                start_blocks=blocks,
-                retract=self.retract,
-                max_iterations=max_iterations,
+            options = LeastSquaresOptions(
+                max_iterations,
                 # A step of δ standard errors reduces the loss ½ s² (N − p) by ½ s² δ².
                 tolerance=tolerance**2 / self.freedom,
                 # A step is solved to about the dtype's resolution to the power 3/4.
                 perfect=0.5 * self.plan.n_data * float(jnp.finfo(self.plan.start.position.dtype).eps) ** 0.75,
-                progress=tell,
             )
-            if kept is None:
-                return begun()
-            return kept.minimised(self, lambda since, keep: begun(since=since, keep=keep))
+
+            def begun(since: Iterate | None = None, keep: Keep | None = None) -> Solution:
+                def before_step(now: Iterate) -> None:
+                    if keep is not None:
+                        keep(now)
+                    if tell is not None:
+                        tell(len(now.losses) - 1, now.losses[-1])
+
+                return bounded_least_squares(
+                    self.linearize,
+                    since or x,
+                    lower=x if held else self.space.lower,
+                    upper=x if held else self.space.upper,
+                    start_blocks=blocks,
+                    retract=self.retract,
+                    options=options,
+                    callback=before_step,
+                )
+
+            return begun() if kept is None else kept.minimised(self, begun)
 
         self.smoothing = None
         if self.jumps is None:

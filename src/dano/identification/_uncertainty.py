@@ -25,21 +25,13 @@ from dano.solvers import eliminated, NormalEquations, Stop
 
 
 class Errors(NamedTuple):
-    """How far the fitted motion is from the observed one, over all frames that count.
+    """How far the fitted motion is from the observed one, over all frames that count."""
 
-    Attributes:
-        mean_position: [m]; NaN if positions were not observed.
-        final_position: Mean over motions of the last frame's [m].
-        mean_rotation: [rad].
-        final_rotation: Mean over motions of the last frame's [rad].
-        rms: Of all residuals, in standard deviations of the noise [1].
-    """
-
-    mean_position: float
-    final_position: float
-    mean_rotation: float
-    final_rotation: float
-    rms: float
+    mean_position: float  # [m]; NaN if positions were not observed
+    final_position: float  # Mean over motions of the last frame's [m]
+    mean_rotation: float  # [rad]
+    final_rotation: float  # Mean over motions of the last frame's [rad]
+    rms: float  # Of all residuals, in standard deviations of the noise [1]
 
 
 class Minimum(NamedTuple):
@@ -52,59 +44,38 @@ class Minimum(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Identification:
-    """Identified parameters.
+    """Identified parameters."""
 
-    Attributes:
-        values: By name of the parameter.
-        standard_errors: By name; ∞ where the data say nothing, NaN for a value on a bound.
-        covariance: Of the coordinates `labels`, shape (p, p).
-        labels: Names of the coordinates: those of the parameters, with indices for arrays.
-        stop: Why the search ended.
-        loss_history: Half the sum of squared residuals, in standard deviations, at the start and after each
-            step.
-        messages: Sentences about parameters on a bound or not determined, and about failed steps.
-        errors: Of the fit.
-        held_out_errors: Of the motions held out, or None.
-        minima: Where each start ended, best first.
-        scene: The scene with the values.
-        controls: The controls with the values, as they were given.
-        initial: Quantities that were estimated of the state in which each window begins.
-        initial_states: State in which each window begins, of centres of mass, whatever the motions say.
-        motions: What was observed.
-        fitted: What the simulation says at the frames of each motion, with the values found.
-        guessed: The same at the start of the search.
-        smoothed: Whether the loss is rough and the values are where its trend is least; standard errors then
-            hold its ripples.
-        worth: What derivatives of the loss are worth there, if it is rough or no step reduces it; else None.
-        freedom: Observed numbers less estimated ones; of windows or motions that are independent
-            (`IdentifyOptions.independent`) their number less one.
-        evaluations: How often all windows were simulated, with derivatives.
-        seconds: Time it took [s], compilation included.
-        masses: Mass [kg] and its standard error of bodies whose `mass_scale` was found, by name.
-    """
-
-    values: dict[str, Any]
-    standard_errors: dict[str, Any]
-    covariance: np.ndarray
-    labels: tuple[str, ...]
-    stop: Stop
+    values: dict[str, Any]  # By name of the parameter
+    standard_errors: dict[str, Any]  # By name; ∞ where the data say nothing, NaN for a value on a bound
+    covariance: np.ndarray  # Of the coordinates `labels`, shape (p, p)
+    labels: tuple[str, ...]  # Names of the coordinates: those of the parameters, with indices for arrays
+    stop: Stop  # Why the search ended
+    # Half the sum of squared residuals, in standard deviations, at the start and after each step.
     loss_history: np.ndarray
+    # Sentences about parameters on a bound or not determined, and about failed steps.
     messages: tuple[str, ...]
-    errors: Errors
-    held_out_errors: Errors | None
-    minima: tuple[Minimum, ...]
-    scene: Scene
-    controls: Any
-    initial: tuple[str, ...]
-    initial_states: State
-    motions: tuple[Motion, ...]
-    fitted: tuple[Motion, ...]
-    guessed: tuple[Motion, ...]
+    errors: Errors  # Of the fit
+    held_out_errors: Errors | None  # Of the motions held out, or None
+    minima: tuple[Minimum, ...]  # Where each start ended, best first
+    scene: Scene  # The scene with the values
+    controls: Any  # The controls with the values, as they were given
+    initial: tuple[str, ...]  # Quantities that were estimated of the state in which each window begins
+    initial_states: State  # State in which each window begins, of centres of mass, whatever the motions say
+    motions: tuple[Motion, ...]  # What was observed
+    fitted: tuple[Motion, ...]  # What the simulation says at the frames of each motion, with the values found
+    guessed: tuple[Motion, ...]  # The same at the start of the search
+    # Whether the loss is rough and the values are where its trend is least; standard errors then hold its
+    # ripples.
     smoothed: bool
+    # What derivatives of the loss are worth there, if it is rough or no step reduces it; else None.
     worth: Check | None
+    # Observed numbers less estimated ones; of windows or motions that are independent
+    # (`IdentifyOptions.independent`) their number less one.
     freedom: int
-    evaluations: int
-    seconds: float
+    evaluations: int  # How often all windows were simulated, with derivatives
+    seconds: float  # Time it took [s], compilation included
+    # Mass [kg] and its standard error of bodies whose `mass_scale` was found, by name.
     masses: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -232,14 +203,20 @@ class Uncertainty(NamedTuple):
     messages: tuple[str, ...]  # Sentences about what is not determined
 
 
+class Fitted(NamedTuple):
+    """Where the loss is least, and what is left of it there."""
+
+    space: Space  # The parameters
+    x: np.ndarray  # Their coordinates
+    normal: NormalEquations  # Normal equations there
+    lengths: np.ndarray  # Of the residuals in standard deviations, without those that were not observed
+    n_data: int  # How many numbers were observed
+    scene: Scene  # The scene at the start, for the words
+
+
 def uncertainty(
-    space: Space,
-    x: np.ndarray,
-    normal: NormalEquations,
-    lengths: np.ndarray,
+    fitted: Fitted,
     huber: float | None,
-    n_data: int,
-    scene: Scene,
     ripple: np.ndarray | None = None,
     least: float = 0.0,
     groups: Groups | None = None,
@@ -251,18 +228,14 @@ def uncertainty(
     Statistics, 1981, 7.6).
 
     Args:
-        space: The parameters.
-        x: Coordinates where the loss is least.
-        normal: Normal equations there.
-        lengths: Of the residuals in standard deviations, without those that were not observed.
+        fitted: Where the loss is least.
         huber: Length from which residuals count linearly, or None.
-        n_data: How many numbers were observed.
-        scene: The scene at the start, for the words.
         ripple: Covariance of the coordinates that a rough loss adds, shape (p, p); default none.
         least: Least s²; 1 where residuals are smaller because frames share what they are off by.
         groups: Groups of residuals that are independent of each other; None: every number is. With groups the
             covariance is `between_groups`.
     """
+    space, x, normal, lengths, n_data, _ = fitted
     p = len(x)
     _, hessian = eliminated(normal)
     on_bound = (x <= space.lower) | (x >= space.upper)
@@ -290,7 +263,7 @@ def uncertainty(
         rough = np.zeros((len(free), len(free))) if ripple is None else ripple[np.ix_(free, free)]
         mine = None if groups is None else groups.of(free)
         curvature = hessian[np.ix_(free, free)]
-        found, more = _inverse(space, x, curvature, variance, free, scene, freedom, rough, mine)
+        found, more = _inverse(fitted, free, curvature, variance, freedom, rough, mine)
         covariance[np.ix_(free, free)] = found
         messages += more
     return Uncertainty(covariance, freedom, tuple(messages))
@@ -364,16 +337,16 @@ def _private(normal: NormalEquations) -> int:
 
 
 def _inverse(
-    space: Space,
-    x,
-    hessian,
+    fitted: Fitted,
+    free: np.ndarray,
+    hessian: np.ndarray,
     variance: float,
-    free,
-    scene: Scene,
     freedom: int,
-    rough,
+    rough: np.ndarray,
     groups: Groups | None,
-):
+) -> tuple[np.ndarray, list[str]]:
+    """Covariance of the coordinates that are free, and sentences about what is not determined."""
+    space, x = fitted.space, fitted.x
     width = space.upper[free] - space.lower[free]
     span = np.where(np.isfinite(width), width, np.maximum(np.abs(x[free]), 1e-3))
     # In shares of each parameter's range, so that units do not decide what is flat.
@@ -389,7 +362,7 @@ def _inverse(
     covariance = covariance + rough / squares
     messages = []
     for k in np.flatnonzero(flat):
-        messages.append(_words(space, free, vectors[:, k], scene))
+        messages.append(_words(space, free, vectors[:, k], fitted.scene))
         lost = np.abs(vectors[:, k]) > 1e-3
         covariance[lost, lost] = np.inf
     errors = np.sqrt(np.diag(covariance))

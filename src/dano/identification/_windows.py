@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from dano.identification._settings import IdentifyOptions
 from dano.identification.motions import (
     JOINT_NUMBERS,
     joint_numbers,
@@ -22,7 +23,7 @@ from dano.identification.motions import (
     SMOOTHING_FRAMES,
 )
 from dano.maths import quat_rotate, quat_to_matrix
-from dano.scene import Control, Layout, Scene, State
+from dano.scene import Control, Scene, State, StateLayout
 
 _TOLD = 3.0
 """Factor of the standard deviations with which velocities from a tracker's poses count besides the poses: the
@@ -174,7 +175,7 @@ class Windows(eqx.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class WindowPlan:
     """Windows, and what the host knows of them."""
 
     windows: Windows  # The windows
@@ -195,10 +196,9 @@ def plan_windows(
     controls: Sequence[Control | None],
     noise: Mapping[str, float],
     initial: Sequence[str],
-    window: int | None,
-    continuous: bool,
+    options: IdentifyOptions,
     smoothing: int = SMOOTHING_FRAMES,
-) -> Plan:
+) -> WindowPlan:
     """Cut motions into windows.
 
     Args:
@@ -208,8 +208,7 @@ def plan_windows(
         controls: Forces for each step of each motion, or None.
         noise: Standard deviation of each quantity that counts.
         initial: Quantities of the initial states that are estimated.
-        window: Frames of a window; None: all.
-        continuous: Whether windows are simulated up to the beginning of the next.
+        options: How long windows are, and whether they are simulated up to the beginning of the next.
         smoothing: Frames that say how fast a window begins where that was not observed.
 
     Raises:
@@ -219,8 +218,8 @@ def plan_windows(
     pieces: list[dict] = []
     for number, (motion, state, control) in enumerate(zip(motions, states, controls, strict=True)):
         what = f"motion {number}" if len(motions) > 1 else "the motion"
-        full = _on_all_bodies(scene, motion, what)
-        pieces += _cut(scene, motion, full, state, control, number, window, smoothing, what)
+        for piece in _cut(scene, motion, state, options.window, smoothing, what):
+            pieces.append({**piece, "owner": number, "control": control})
     _report_impacts(scene, pieces, initial)
     seen = _observed(scene, motions)
     dtype = scene.timestep.dtype
@@ -229,7 +228,7 @@ def plan_windows(
     n_data = sum(int(np.sum((np.asarray(w) > 0) * sizes[key])) for key, w in weights.items())
     elapsed = [piece["times"] - piece["times"][0] for piece in pieces]
     until = [
-        piece["until"] - piece["times"][0] if continuous else e[-1]
+        piece["until"] - piece["times"][0] if options.gaps else e[-1]
         for piece, e in zip(pieces, elapsed, strict=True)
     ]
     owner = np.array([piece["owner"] for piece in pieces])
@@ -265,7 +264,7 @@ def plan_windows(
         key: jnp.asarray(np.stack([piece["start"][key] for piece in pieces]), dtype) for key in names
     }
     rows = [piece["rows"] for piece in pieces]
-    return Plan(windows, State(**start), n_steps, owner, rows, tuple(seen), tuple(weights), n_data)
+    return WindowPlan(windows, State(**start), n_steps, owner, rows, tuple(seen), tuple(weights), n_data)
 
 
 def _observed(scene: Scene, motions: Sequence[Motion]) -> list[int]:
@@ -290,7 +289,7 @@ def _stacked(values: list[np.ndarray], fill: float = 0.0) -> np.ndarray:
 
 
 def _weighed(
-    layout: Layout,
+    layout: StateLayout,
     pieces: list[dict],
     seen: Sequence[int],
     noise: Mapping[str, float],
@@ -391,11 +390,9 @@ def _covariance_on_all_bodies(scene: Scene, motion: Motion, first: int, last: in
     return full
 
 
-def _cut(
-    scene, motion: Motion, full, state, control, number: int, window: int | None, smoothing: int, what: str
-):
+def _cut(scene, motion: Motion, state, window: int | None, smoothing: int, what: str) -> list[dict[str, Any]]:
     """The windows of one motion, one after the other without overlap."""
-    h = float(scene.timestep)
+    full = _on_all_bodies(scene, motion, what)
     moving = np.array([i for i, body in enumerate(scene.bodies) if not body.fixed])
     smooth = _on_all_bodies(scene, motion.with_velocities(smoothing), what)
     complete = _says_where(scene, motion, full, state is not None, moving)
@@ -408,10 +405,9 @@ def _cut(
         first += int(ready[0])
         last = n if window is None else min(first + window, n)
         if last - first >= 2:
-            start, struck = _initial(scene, motion, full, smooth, state, first, h, what, origins)
+            start, struck = _initial(scene, motion, full, smooth, state, first, what, origins)
             pieces.append(
                 {
-                    "owner": number,
                     "rows": np.arange(first, last),
                     "times": motion.times[first:last],
                     "until": motion.times[min(last, n - 1)],
@@ -419,7 +415,6 @@ def _cut(
                     "origins": origins,
                     "start": start,
                     "struck": struck,
-                    "control": control,
                     "q": _joints_on_all_bodies(scene, motion, first, last),
                     "covariance": _covariance_on_all_bodies(scene, motion, first, last),
                     "alike": motion.alike,
@@ -454,12 +449,12 @@ def _says_where(scene, motion, full, has_state: bool, moving) -> np.ndarray:
     return ready
 
 
-def _initial(scene, motion, full, smooth, state, first: int, h: float, what: str, origins):
+def _initial(scene, motion, full, smooth, state, first: int, what: str, origins):
     """Initial state of the window that begins at a frame, as a dict of arrays (n, ·).
 
     And which measured velocities of bodies, shape (n,), have an impact beside them.
     """
-    start, struck = {}, {}
+    start, struck, h = {}, {}, float(scene.timestep)
     unseen = [i for i, body in enumerate(scene.bodies) if not body.fixed and body.name not in motion.names]
     if unseen and first > 0:
         raise ValueError(

@@ -17,7 +17,7 @@ from jaxtyping import Int
 from dano.mujoco._search import CALLBACK, CALLBACK_FEATURES, NearSearch
 from dano.mujoco._settings import Writer
 from dano.mujoco.kernels.words import Entry, Head, SHIFT
-from dano.native import cpu_kernel, Launch, Parameters
+from dano.native import cpu_kernel, KernelLaunch, Parameters
 
 _PAGE = 4096
 """Bytes from one address where memory may end to the next."""
@@ -116,7 +116,7 @@ class Direct:
         given, address = Parameters(self._kernel.layout), np.zeros(1, np.int64)
         given.put("head", self._head.ctypes.data)
         given.show("address", address)
-        Launch(self._kernel, given, 1)()
+        KernelLaunch(self._kernel, given, 1)()
         self._address = int(address[0])
 
     def install(self) -> None:

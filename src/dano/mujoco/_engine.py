@@ -56,15 +56,12 @@ class MuJoCoEngine(AbstractEngine):
     central differences of MuJoCo's step, forward and reverse; with respect to shapes, samples, centres of
     mass and places of joints they are zero. MuJoCo's contact forces jump where a point begins to touch, and
     differences across a jump are large: what they say of a rollout with impacts is of little use.
-
-    Attributes:
-        names: Bodies of the scene (static).
-        objects: As what neural objects touch: "samples", "hull" or "distance" (static).
-        difference: Step of the differences in SI units, of masses, inertias, timesteps a share (static).
     """
 
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # Bodies of the scene (static)
+    # As what neural objects touch: "samples", "hull" or "distance" (static).
     objects: str = eqx.field(static=True)
+    # Step of the differences in SI units, of masses, inertias, timesteps a share (static).
     difference: float = eqx.field(static=True)
     _twin: Twin = eqx.field(static=True)
 

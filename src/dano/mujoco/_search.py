@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dano.mujoco._settings import is_gap_beyond, Settings
+from dano.mujoco._settings import ContactSettings, is_gap_beyond
 from dano.mujoco._things import AttachedObject, Geom, object_solid, Solid, Surface
 from dano.mujoco.kernels import words
 from dano.mujoco.kernels.words import REALS, WHOLES
@@ -15,8 +15,8 @@ from dano.native import (
     cpu_kernel,
     Features,
     instance,
+    KernelLaunch,
     kind_numbers,
-    Launch,
     layout_of,
     lower_bounds,
     Parameters,
@@ -287,10 +287,10 @@ class NearSearch:
         arrays = {**known.arrays, **{f"work.{name}": values for name, values in work.items()}}
         for place, values in {**arrays, **views_of(parameters, model=model, data=data)}.items():
             parameters.show(place, values)
-        self.launch = Launch(known.kernel, parameters, 1)
+        self.launch = KernelLaunch(known.kernel, parameters, 1)
         self.lines = list(zip(self.rows, self.wholes, strict=True))
 
-    def give(self, pair: int, settings: Settings | None) -> None:
+    def give(self, pair: int, settings: ContactSettings | None) -> None:
         """Say what the parameters of a pair are."""
         self.settings[pair] = 0.0 if settings is None else settings.numbers()
 

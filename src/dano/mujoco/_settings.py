@@ -31,24 +31,16 @@ _ANGLE = 0.25
 """Most that the spring turns in a timestep [rad]: a rebound takes 12 steps or more."""
 
 
-class Settings(NamedTuple):
-    """Parameters of the contacts of two geoms, as in `mjContact`.
+class ContactSettings(NamedTuple):
+    """Parameters of the contacts of two geoms, as in `mjContact`."""
 
-    Attributes:
-        dim: Directions of force: 1, 3, 4 or 6.
-        friction: Two sliding [1], one torsional [m], two rolling coefficients [m], shape (5,).
-        solref: Time constant [s] and damping ratio, or, negative, stiffness and damping.
-        solimp: Impedance, shape (5,).
-        margin: Distance from which contacts are listed [m].
-        gap: By how much nearer they are when they begin to press [m].
-    """
-
-    dim: int
+    dim: int  # Directions of force: 1, 3, 4 or 6
+    # Two sliding [1], one torsional [m], two rolling coefficients [m], shape (5,).
     friction: Float[np.ndarray, "5"]
-    solref: Float[np.ndarray, "2"]
-    solimp: Float[np.ndarray, "5"]
-    margin: float = 0.0
-    gap: float = 0.0
+    solref: Float[np.ndarray, "2"]  # Time constant [s] and damping ratio, or, negative, stiffness and damping
+    solimp: Float[np.ndarray, "5"]  # Impedance, shape (5,)
+    margin: float = 0.0  # Distance from which contacts are listed [m]
+    gap: float = 0.0  # By how much nearer they are when they begin to press [m]
 
     def numbers(self) -> Float[np.ndarray, "15"]:
         """As `dano.mujoco.kernels.tables.Settings` has them."""
@@ -56,10 +48,10 @@ class Settings(NamedTuple):
         return np.concatenate([np.asarray(part, np.float64) for part in parts])
 
 
-def overriding(model: Any) -> Settings:
+def overriding(model: Any) -> ContactSettings:
     """The model's global contact parameters; of its directions and gap nothing is said."""
     option = model.opt
-    return Settings(0, option.o_friction, option.o_solref, option.o_solimp, float(option.o_margin))
+    return ContactSettings(0, option.o_friction, option.o_solref, option.o_solimp, float(option.o_margin))
 
 
 @functools.cache

@@ -9,14 +9,14 @@ from jaxtyping import Bool, Int
 
 from dano.mujoco._model import standin_name
 from dano.mujoco._search import BridgeModel, NearSearch, Part, part_of_geom, part_of_thing
-from dano.mujoco._settings import overriding, Settings
+from dano.mujoco._settings import ContactSettings, overriding
 from dano.mujoco._things import AttachedObject, geom_of
 from dano.mujoco._worlds import Worlds
 
 MOST = 8
 """Contacts of a pair, unless said otherwise."""
 
-Chooser = Callable[[Any, int, int], Settings | None]
+Chooser = Callable[[Any, int, int], ContactSettings | None]
 """From a model and two of its geoms to the parameters of their contacts; None if they do not touch."""
 
 

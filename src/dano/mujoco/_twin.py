@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from dano.maths import quat_exp, quat_log
 from dano.mujoco._bridge import Bridge
 from dano.mujoco._model import library
-from dano.mujoco._settings import LEAST_FRICTION, Settings, spring_of
+from dano.mujoco._settings import ContactSettings, LEAST_FRICTION, spring_of
 from dano.mujoco._spec import add_mesh, AS_SAMPLES, joint_names, motor_name, spec_of, weigh_later
 from dano.scene import Scene
 
@@ -137,13 +137,13 @@ class Twin:
         self._sprung: tuple[Any, ...] | None = None
         self._weights: tuple[Any, ...] | None = None
 
-    def _settings(self, model: Any, a: int, b: int) -> Settings | None:
+    def _settings(self, model: Any, a: int, b: int) -> ContactSettings | None:
         found = self._pair_of.get((int(model.geom_bodyid[a]), int(model.geom_bodyid[b])))
         if found is None:
             return None
         friction = max(float(self._friction[found[0]]), LEAST_FRICTION)
         five = np.array([friction, friction, LEAST_FRICTION, LEAST_FRICTION, LEAST_FRICTION])
-        return Settings(3, five, *self._springs[found[0]])
+        return ContactSettings(3, five, *self._springs[found[0]])
 
     def load(self, data: Any, motion: Motion, constants: Constants) -> None:
         """Write a state and its constants into the model and some data."""

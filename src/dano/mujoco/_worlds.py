@@ -11,7 +11,7 @@ import numpy as np
 
 from dano.extras import optional
 from dano.mujoco._search import BridgeModel
-from dano.mujoco._settings import Settings
+from dano.mujoco._settings import ContactSettings
 from dano.native import begin, instance
 
 _WORLDS, _TABLES = "dano.mujoco.kernels.worlds", "dano.mujoco.kernels.tables"
@@ -37,7 +37,7 @@ def warp_device() -> Any:
 class Worlds:
     """What MuJoCo Warp calls in each step of a model, for each data that is stepped."""
 
-    def __init__(self, known: BridgeModel, most: int, given: Sequence[Settings | None] | None):
+    def __init__(self, known: BridgeModel, most: int, given: Sequence[ContactSettings | None] | None):
         """See `dano.mujoco.Bridge.put_model`.
 
         Args:

@@ -25,14 +25,14 @@ from dano.native._leaves import (
     Leaves as Leaves,
     leaves_of as leaves_of,
     lower_bounds as lower_bounds,
-    Placed as Placed,
+    PlacedField as PlacedField,
     shape_kinds as shape_kinds,
     slabs_of_blocks as slabs_of_blocks,
 )
 from dano.native._objects import (
     cpu_kernel as cpu_kernel,
     Kernel as Kernel,
-    Launch as Launch,
+    KernelLaunch as KernelLaunch,
     LEVELS as LEVELS,
     make_object as make_object,
     shipped_path as shipped_path,

@@ -55,7 +55,7 @@ def shape_kinds() -> frozenset[int]:
     return frozenset(map(kind_number, PRIMITIVES))
 
 
-class Placed(NamedTuple):
+class PlacedField(NamedTuple):
     """A field in a frame: x = s R y + p for y in its own."""
 
     field: AbstractField
@@ -64,7 +64,7 @@ class Placed(NamedTuple):
     rotation: Float[AnyArray, "3 3"]
 
     @classmethod
-    def still(cls, field: AbstractField, dtype: DTypeLike) -> "Placed":
+    def still(cls, field: AbstractField, dtype: DTypeLike) -> "PlacedField":
         """A field in its own frame."""
         return cls(field, np.ones((), dtype), np.zeros(3, dtype), np.eye(3, dtype=dtype))
 
@@ -76,7 +76,7 @@ class Placed(NamedTuple):
 
     def inside(
         self, field: AbstractField, pose: Pose | None = None, factor: AnyArray | None = None
-    ) -> "Placed":
+    ) -> "PlacedField":
         """What the field is made of."""
         dtype, position, rotation, size = self.factor.dtype, self.position, self.rotation, self.factor
         if factor is not None:
@@ -84,23 +84,16 @@ class Placed(NamedTuple):
         if pose is not None:
             position = position + size * matvec(rotation, pose.position.astype(dtype))
             rotation = matmul(rotation, pose.matrix.astype(dtype))
-        return Placed(field, size, position, rotation)
+        return PlacedField(field, size, position, rotation)
 
 
 class Leaves(NamedTuple):
-    """Leaves as rows.
+    """Leaves as rows."""
 
-    Attributes:
-        rows: See `dano.physics.solids.distances.Leaf`.
-        kinds: See `dano.physics.solids.distances.LeafKind`.
-        coefficients: Spline coefficients of all grids, one below the other.
-        bounds: Lower bounds on splines, see `lower_bounds`, one below the other.
-    """
-
-    rows: Float[AnyArray, "leaves 20"]
-    kinds: Int[np.ndarray, "leaves 7"]
-    coefficients: Float[AnyArray, "coefficients 1"]
-    bounds: Float[AnyArray, "bounds 1"]
+    rows: Float[AnyArray, "leaves 20"]  # See `dano.physics.solids.distances.Leaf`
+    kinds: Int[np.ndarray, "leaves 7"]  # See `dano.physics.solids.distances.LeafKind`
+    coefficients: Float[AnyArray, "coefficients 1"]  # Spline coefficients of all grids, one below the other
+    bounds: Float[AnyArray, "bounds 1"]  # Lower bounds on splines, see `lower_bounds`, one below the other
 
 
 def is_known(field: AbstractField) -> bool:
@@ -120,7 +113,7 @@ def _inner(field: PosedShape | ScaledShape | PosedField | ScaledField) -> Abstra
     return field.shape if isinstance(field, PosedShape | ScaledShape) else field.field
 
 
-def leaves_of(placed: Placed) -> list[Placed]:
+def leaves_of(placed: PlacedField) -> list[PlacedField]:
     """The shapes that a shape is made of.
 
     Raises:
@@ -142,12 +135,12 @@ def leaves_of(placed: Placed) -> list[Placed]:
     return [placed]
 
 
-def kinds_of(leaves: Sequence[Placed]) -> set[int]:
+def kinds_of(leaves: Sequence[PlacedField]) -> set[int]:
     """Kinds of leaves."""
     return {kind_number(each.leaf.kind) for each in leaves}
 
 
-def leaf_tables(leaves: Sequence[Placed], dtype: DTypeLike) -> Leaves:
+def leaf_tables(leaves: Sequence[PlacedField], dtype: DTypeLike) -> Leaves:
     """Rows of leaves."""
     if not leaves:
         none = np.zeros((0, 1), dtype)

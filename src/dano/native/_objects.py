@@ -38,17 +38,11 @@ _LIBRARIES = {"linux": ("warp.so", "warp-clang.so"), "darwin": ("libwarp.dylib",
 
 
 class Kernel(NamedTuple):
-    """A kernel that can be called.
+    """A kernel that can be called."""
 
-    Attributes:
-        layout: Of its parameters.
-        call: From the addresses of bounds and parameters.
-        address: Of the function itself.
-    """
-
-    layout: Layout
-    call: Any
-    address: int
+    layout: Layout  # Of its parameters
+    call: Any  # From the addresses of bounds and parameters
+    address: int  # Of the function itself
 
 
 class Bounds(ctypes.Structure):
@@ -62,7 +56,7 @@ class Bounds(ctypes.Structure):
         return cls((ctypes.c_uint32 * 2)(count, 1), count, 1)
 
 
-class Launch:
+class KernelLaunch:
     """A launch of a kernel with parameters of its own."""
 
     def __init__(self, kernel: Kernel, parameters: Parameters, count: int):

@@ -65,17 +65,11 @@ def flattened(surface: SurfaceSamples, spacing: ArrayLike) -> SurfaceSamples:
 
 
 class FlatFace(NamedTuple):
-    """A flat region of a surface.
+    """A flat region of a surface."""
 
-    Attributes:
-        normal: Unit outward normal [F].
-        offset: Where the plane is: n · x = offset [m, F].
-        members: Samples that lie on the plane, those of its rim included, shape (n,).
-    """
-
-    normal: Float[np.ndarray, "3"]
-    offset: float
-    members: Bool[np.ndarray, " n"]
+    normal: Float[np.ndarray, "3"]  # Unit outward normal [F]
+    offset: float  # Where the plane is: n · x = offset [m, F]
+    members: Bool[np.ndarray, " n"]  # Samples that lie on the plane, those of its rim included, shape (n,)
 
 
 def flat_faces(surface: SurfaceSamples, spacing: ArrayLike) -> list[FlatFace]:

@@ -58,31 +58,22 @@ _DENSE, _FOOT = 0.5, 0.1
 
 
 class Interior(eqx.Module):
-    """The inside of a density field in numbers.
+    """The inside of a density field in numbers."""
 
-    Attributes:
-        level: Density of its surface.
-        wall: Median density near the surface, 1.5 to 4 cells inside.
-        gap: Radius [cells of the lattice] of the pores that were closed to make the surface watertight; NaN
-            if no watertight surface was found.
-        deep: Median density deep inside as a share of that near the surface: 1 for a solid, 0 for a hollow;
-            NaN if it is too thin to tell.
-        spread: Unevenness, (upper − lower quartile)/(2 · median) of the densities inside; about 0 for a
-            solid.
-        outside: Share of ∫φ further than two cells from the solid: haze and floaters.
-        cavity: Share of the solid's volume whose density is below the level.
-        largest: Largest density.
-        growth: Share by which the volume of the solid grows if the level is halved; ≪ 1 if the wall is sharp.
-    """
-
-    level: Float[Array, ""]
-    wall: Float[Array, ""]
+    level: Float[Array, ""]  # Density of its surface
+    wall: Float[Array, ""]  # Median density near the surface, 1.5 to 4 cells inside
+    # Radius [cells of the lattice] of the pores that were closed to make the surface watertight; NaN if no
+    # watertight surface was found.
     gap: Float[Array, ""]
+    # Median density deep inside as a share of that near the surface: 1 for a solid, 0 for a hollow; NaN if it
+    # is too thin to tell.
     deep: Float[Array, ""]
+    # Unevenness, (upper − lower quartile)/(2 · median) of the densities inside; about 0 for a solid.
     spread: Float[Array, ""]
-    outside: Float[Array, ""]
-    cavity: Float[Array, ""]
-    largest: Float[Array, ""]
+    outside: Float[Array, ""]  # Share of ∫φ further than two cells from the solid: haze and floaters
+    cavity: Float[Array, ""]  # Share of the solid's volume whose density is below the level
+    largest: Float[Array, ""]  # Largest density
+    # Share by which the volume of the solid grows if the level is halved; ≪ 1 if the wall is sharp.
     growth: Float[Array, ""]
 
     def flaws(self) -> list[str]:

@@ -11,10 +11,10 @@ from dano.checks import checked_count, checked_number
 from dano.fields import AbstractField, density_at, GridField
 from dano.keys import key_words
 from dano.maths import checked_array, checked_key, is_traced, Numbers
+from dano.progress import Progress
 
 Density = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
 """Densities at points [m, F] of the host."""
-Progress = Callable[[str, float], None]
 
 # Cells looked at together.
 BATCH = 1 << 16

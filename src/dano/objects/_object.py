@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import LOOK, OBJECT, read_archive, write_archive
-from dano.checks import checked_choice, checked_count, checked_function
+from dano.checks import checked_choice, checked_count, checked_progress
 from dano.fields import AbstractField, AbstractShape, GridField, SignedDistanceGrid
 from dano.keys import folded_key, split_key
 from dano.maths import checked_array, checked_key, checked_points, floating, is_traced, Numbers
@@ -26,7 +26,6 @@ from dano.objects._mass import (
     integrate,
     integrated,
     MassProperties,
-    Progress,
 )
 from dano.objects._samples import (
     baked,
@@ -39,6 +38,7 @@ from dano.objects._samples import (
 )
 from dano.objects._solid import field_solid, level_set
 from dano.objects._surface import draw_surface, equal_areas, SurfaceSamples
+from dano.progress import Progress
 
 MassModel = Literal["auto", "density", "solid"]
 FORMAT, VERSION = OBJECT
@@ -55,36 +55,32 @@ _BYTES_PER_NODE = 150
 
 _INTERIOR = tuple(field.name for field in dataclasses.fields(Interior))
 
+# Of a field that grows evenly from its middle to the border of its grid.
+_LIKE_A_DISTANCE = (
+    "the density is smallest in the middle and grows evenly to the border of its grid, as a distance does:"
+    " the object is what lies around; for signed distances there is dano.fields.SignedDistanceGrid"
+)
+
 
 class NeuralObject(eqx.Module):
-    """A density field made ready for simulation.
+    """A density field made ready for simulation."""
 
-    Attributes:
-        samples: Samples of the density near its surface, for the centroid law.
-        surface: Samples on the surface of `solid`, with areas.
-        mass: Mass properties in the field's frame.
-        grid: The field baked for other objects' samples to query, without its floaters; None if there is no
-            field.
-        solid: Signed distance of the object: of {φ = `interior.level`}, without floaters, cavities filled;
-            of a shape, its own. None if there is no field.
-        density_range: Lower and upper density between which the samples lie, shape (2,).
-        bake_error: Root mean square error of `grid` relative to the field's largest density (0 for a grid).
-        interior: What the inside of the field looks like; None for objects made of samples, and in older
-            files.
-        mass_model: How density became mass: "density", "solid", or "given" (static).
-        mass_reason: Why this model, in words (static).
-    """
-
-    samples: ContactSamples
-    surface: SurfaceSamples
-    mass: MassProperties
+    samples: ContactSamples  # Samples of the density near its surface, for the centroid law
+    surface: SurfaceSamples  # Samples on the surface of `solid`, with areas
+    mass: MassProperties  # Mass properties in the field's frame
+    # The field baked for other objects' samples to query, without its floaters; None if there is no field.
     grid: GridField | None
+    # Signed distance of the object: of {φ = `interior.level`}, without floaters, cavities filled; of a shape,
+    # its own. None if there is no field.
     solid: SignedDistanceGrid | None
-    density_range: Float[Array, "2"]
+    density_range: Float[Array, "2"]  # Lower and upper density between which the samples lie, shape (2,)
+    # Root mean square error of `grid` relative to the field's largest density (0 for a grid).
     bake_error: Float[Array, ""]
+    # What the inside of the field looks like; None for objects made of samples, and in older files.
     interior: Interior | None
+    # How density became mass: "density", "solid", or "given" (static).
     mass_model: str = eqx.field(static=True)
-    mass_reason: str = eqx.field(static=True)
+    mass_reason: str = eqx.field(static=True)  # Why this model, in words (static)
 
     def _repr_html_(self) -> str:
         """What notebooks show: mass properties beside a drawing of the surface samples."""
@@ -145,20 +141,12 @@ class NeuralObject(eqx.Module):
         checked_choice("mass_model", mass_model, get_args(MassModel))
         check_scale(mass_scale, mass)
         density_range = None if density_range is None else _checked_range(density_range)
-        if progress is not None:
-            checked_function("progress", progress)
-        say = progress or (lambda description, share: None)
-        n_samples = _checked_samples(n_samples)
-        key = checked_key(key)
+        say = checked_progress(progress)
+        n_samples, key = _checked_samples(n_samples), checked_key(key)
         sampling_key, mass_key = split_key(key)
         original = field
         if isinstance(field, GridField) and is_distance(field):
-            warnings.warn(
-                "the density is smallest in the middle and grows evenly to the border of its grid, as a"
-                " distance does: the object is what lies around; for signed distances there is"
-                " dano.fields.SignedDistanceGrid",
-                stacklevel=2,
-            )
+            warnings.warn(_LIKE_A_DISTANCE, stacklevel=2)
         field, density, lattice, interior = _closed(original, resolution)
         level = float(interior.level)
         model, reason = _weighed(original, interior, mass_model)

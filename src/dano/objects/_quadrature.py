@@ -42,17 +42,12 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 class Quadrature(NamedTuple):
-    """Surface samples of a shape.
+    """Surface samples of a shape."""
 
-    Attributes:
-        points: [m, F], shape (n, 3); directions on the unit ball if `turning` is "ball".
-        vectors: Vector areas [m², F], shape (n, 3); of the unit ball if `turning` is "ball".
-        turning: How they turn with the body: "fixed" to it; about its "axis" they keep facing the other body;
-            of a "ball", all do.
-    """
-
-    points: np.ndarray
-    vectors: np.ndarray
+    points: np.ndarray  # [m, F], shape (n, 3); directions on the unit ball if `turning` is "ball"
+    vectors: np.ndarray  # Vector areas [m², F], shape (n, 3); of the unit ball if `turning` is "ball"
+    # How they turn with the body: "fixed" to it; about its "axis" they keep facing the other body; of a
+    # "ball", all do.
     turning: str
 
 

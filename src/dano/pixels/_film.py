@@ -35,18 +35,13 @@ _MOMENTS = 5
 """Pictures that a blurred frame is the mean of: enough for some pixels of blur."""
 
 
-class Frames(NamedTuple):
-    """Pictures of a rollout.
+class RolloutPictures(NamedTuple):
+    """Pictures of a rollout."""
 
-    Attributes:
-        colour: sRGB of the pixels over the background, shape (frames, pixels, 3).
-        opacity: Share of each pixel that bodies cover, shape (frames, pixels).
-        times: Of the frames since the beginning of the rollout [s], shape (frames,).
-    """
-
+    # sRGB of the pixels over the background, shape (frames, pixels, 3).
     colour: Float[Array, "frames pixels 3"]
-    opacity: Float[Array, "frames pixels"]
-    times: Float[Array, " frames"]
+    opacity: Float[Array, "frames pixels"]  # Share of each pixel that bodies cover, shape (frames, pixels)
+    times: Float[Array, " frames"]  # Of the frames since the beginning of the rollout [s], shape (frames,)
 
 
 def film(
@@ -64,7 +59,7 @@ def film(
     shutter: float = 0.0,
     sampling: Sampling = FILM_SAMPLING,
     engine: AbstractEngine | None = None,
-) -> Frames:
+) -> RolloutPictures:
     """Simulate a scene and render some of its bodies, differentiably.
 
     Differentiate with respect to leaves of `scene`, `state`, `controls` or `lights`, forward or in reverse;
@@ -119,7 +114,7 @@ def film(
         light = jnp.maximum(colour, 1e-6).reshape(*steps.shape, *colour.shape[1:]) ** GAMMA
         colour = jnp.mean(light, axis=1) ** (1 / GAMMA)
         opacity = jnp.mean(opacity.reshape(*steps.shape, -1), axis=1)
-    return Frames(colour, opacity, trajectory.times[at])
+    return RolloutPictures(colour, opacity, trajectory.times[at])
 
 
 def _placed(

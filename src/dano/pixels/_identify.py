@@ -1,6 +1,7 @@
 """Parameters of a scene from the pixels of a film, through the simulation."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,21 +45,16 @@ _SUNK = 0.25
 
 
 class FilmFit(NamedTuple):
-    """Parameters from a film.
+    """Parameters from a film."""
 
-    Attributes:
-        fit: Values with error bars, and the motion that they give; that of the poses if pixels add nothing.
-        poses: The same from the poses alone, which the search began with.
-        tracked: What the film shows at the motion found: quality and status of frames, light, silhouettes.
-        history: Values of the parameters after each pass, the first of them from the poses alone.
-        settled: Whether the last pass moved no value by more than a quarter of its standard error.
-    """
-
+    # Values with error bars, and the motion that they give; that of the poses if pixels add nothing.
     fit: Identification
-    poses: Identification
+    poses: Identification  # The same from the poses alone, which the search began with
+    # What the film shows at the motion found: quality and status of frames, light, silhouettes.
     tracked: Tracked
+    # Values of the parameters after each pass, the first of them from the poses alone.
     history: tuple[Mapping[str, Any], ...]
-    settled: bool
+    settled: bool  # Whether the last pass moved no value by more than a quarter of its standard error
 
     @property
     def lamps(self) -> tuple[Light, ...]:
@@ -112,41 +108,27 @@ def identify_in_film(
         ValueError: If the motion is not of one body at the film's times, or as `identify` and `track` say.
     """
     checked_kind("scene", scene, Scene)
-    checked_kind("film", film, Film)
-    checked_kind("look", look, LearnedField)
-    checked_kind("camera", camera, PosedCamera)
-    _check(film, motion, settings)
+    _check(film, look, camera, motion, settings)
     passes = checked_count("passes", passes)
-    body = motion.names[0]
-    tracking = checked_optional("tracking", tracking, TrackOptions) or TrackOptions()
-    tracking = _with_table(scene, motion, tracking)
+    tracking = _with_table(
+        scene, motion, checked_optional("tracking", tracking, TrackOptions) or TrackOptions()
+    )
     film = steady_film(film, camera, background, tracking.readout)
     options = checked_optional("options", settings.pop("options", None), IdentifyOptions) or IdentifyOptions()
     # The trend of a rough loss is worth its simulations only where the search ends.
     on_the_way = dataclasses.replace(options, smooth=False)
-    before = identify(scene, motion, parameters, progress=progress, options=options, **settings)
+    refit = functools.partial(identify, scene, parameters=parameters, progress=progress, **settings)
+    before = refit(observed=motion, options=options)
     fit, history, settled, lamps = before, [before.values], False, None
-    found = pulled = None
+    found, pulled, more = None, None, {"background": background, "progress": progress}
     for k in range(passes):
         seen = fit.fitted[0]
-        found = adjust_poses(
-            film,
-            look,
-            camera,
-            seen.position[:, 0],
-            seen.orientation[:, 0],
-            tracking,
-            background=background,
-            lamps=lamps,
-            progress=progress,
-        )
+        poses = seen.position[:, 0], seen.orientation[:, 0]
+        found = adjust_poses(film, look, camera, *poses, tracking, lamps=lamps, **more)
         lamps = found.lamps if k + 1 >= _LIGHT_PASSES else None
-        alone = Motion.from_tracked(found, body)
+        alone = Motion.from_tracked(found, motion.names[0])
         pulled = _fused(alone, motion, _disagreement(alone, seen))
-        last = fit
-        fit = identify(
-            scene, pulled, parameters, after=fit, progress=progress, options=on_the_way, **settings
-        )
+        last, fit = fit, refit(observed=pulled, after=fit, options=on_the_way)
         history.append(fit.values)
         moved = _moved(last, fit)
         if k == 0 and moved < _SETTLED and _agree(alone, motion):
@@ -156,7 +138,7 @@ def identify_in_film(
             break
     assert found is not None and pulled is not None
     if options.smooth:
-        fit = identify(scene, pulled, parameters, after=fit, progress=progress, options=options, **settings)
+        fit = refit(observed=pulled, after=fit, options=options)
     return FilmFit(_no_smaller(fit, before), before, found, tuple(history), settled)
 
 
@@ -271,7 +253,12 @@ def _moved(before: Identification, after: Identification) -> float:
     return max((float(np.max(move)) for move in moves), default=0.0)
 
 
-def _check(film: Film, motion: Motion, settings: Mapping[str, Any]) -> None:
+def _check(
+    film: Film, look: LearnedField, camera: PosedCamera, motion: Motion, settings: Mapping[str, Any]
+) -> None:
+    checked_kind("film", film, Film)
+    checked_kind("look", look, LearnedField)
+    checked_kind("camera", camera, PosedCamera)
     if not isinstance(motion, Motion) or len(motion.names) != 1:
         raise ValueError(
             f"motion must be of the one body that the film shows, got {getattr(motion, 'names', motion)!r}"

@@ -5,6 +5,7 @@ from dano.planning._execution import (
     follow as follow,
     NEW_PLANS as NEW_PLANS,
     Replan as Replan,
+    Replanning as Replanning,
 )
 from dano.planning._options import PlanOptions as PlanOptions
 from dano.planning._plan import (

@@ -27,39 +27,49 @@ scene that it does not know: that would be lost, and each update of multipliers 
 """
 
 
-class Replan(NamedTuple):
-    """A new plan on the way.
+@dataclass(frozen=True)
+class Replanning:
+    """How the rest of a task is planned again on the way, from the current state on.
 
-    Attributes:
-        step: Of the task.
-        reached: Whether it would have reached the goals.
-        seconds: Time it took [s].
+    The old plan is the first guess. Contact depends on the timestep: a push takes other speeds at h than at
+    h/4. New plans may take smaller steps than the plan: give `scene` the timestep of the plant.
     """
 
-    step: int
-    reached: bool
-    seconds: float
+    # What new plans believe. Its timestep is that of the plan, or that divided by a whole number; controls
+    # are held over a step of the plan all the same.
+    scene: Scene
+    every: int  # Steps between new plans
+    ilqr: TrajectoryOptions = NEW_PLANS  # Of new plans
+
+    def __post_init__(self) -> None:
+        """Check all.
+
+        Raises:
+            ValueError: If one is out of range, or of another kind.
+        """
+        checked_kind("scene", self.scene, Scene)
+        checked_count("every", self.every)
+        checked_kind("ilqr", self.ilqr, TrajectoryOptions)
+
+
+class Replan(NamedTuple):
+    """A new plan on the way."""
+
+    step: int  # Of the task
+    reached: bool  # Whether it would have reached the goals
+    seconds: float  # Time it took [s]
 
 
 @dataclass(frozen=True)
 class Execution:
-    """What came of a plan.
+    """What came of a plan."""
 
-    Attributes:
-        states: Leaves of shape (T · substeps + 1, …).
-        values: Controls [N, N m] of every step of the plan, shape (T, m).
-        goals: How each goal was reached.
-        converged: Whether every step was solved.
-        replans: New plans on the way.
-        seconds: Time it took, with compilation [s].
-    """
-
-    states: State
-    values: Float[Array, "T m"]
-    goals: tuple[GoalError, ...]
-    converged: bool
-    replans: tuple[Replan, ...]
-    seconds: float
+    states: State  # At all steps of the plant, leaves of shape (T · n + 1, …) for n in a step of the plan
+    values: Float[Array, "T m"]  # Controls [N, N m] of every step of the plan, shape (T, m)
+    goals: tuple[GoalError, ...]  # How each goal was reached
+    converged: bool  # Whether every step was solved
+    replans: tuple[Replan, ...]  # New plans on the way
+    seconds: float  # Time it took, with compilation [s]
 
 
 def follow(
@@ -68,45 +78,35 @@ def follow(
     task: Task,
     plan: Plan,
     *,
-    scene: Scene | None = None,
-    substeps: int = 1,
+    replanning: Replanning | None = None,
     feedback: bool = True,
-    every: int | None = None,
-    ilqr: TrajectoryOptions | None = None,
     engine: AbstractEngine | None = None,
 ) -> Execution:
     """Carry a plan out in a scene that may differ from the planned one.
 
     Controls are held over a step of the plan: u_t + K_t (x ⊟ x_t) within their bounds, or u_t without
-    feedback. With `every`, the rest of the task is planned again after so many steps. The new plan begins at
-    the current state, with the old plan as first guess: model-predictive control.
-
-    Contact depends on the timestep: a push takes other speeds at h than at h/4. New plans may take smaller
-    steps than the plan: give `scene` the timestep of the plant.
+    feedback. With `replanning` the rest of the task is planned again on the way: model-predictive control.
 
     Args:
-        plant: What really happens: the same bodies, other numbers; its timestep is that of the plan divided
-            by `substeps`.
+        plant: What really happens: the same bodies, other numbers; its timestep is that of the plan or that
+            divided by a whole number.
         state: Where it begins.
         task: What shall be done.
         plan: The plan.
-        scene: What new plans believe; needed with `every`. Its timestep is that of the plan, or that divided
-            by a whole number; controls are held over a step of the plan all the same.
-        substeps: Steps of `plant` in a step of the plan.
+        replanning: How new plans are made on the way; None: there are none.
         feedback: Whether to use the plan's gains.
-        every: Steps between new plans; None: no new plans.
-        ilqr: Of new plans; default `dano.plan.NEW_PLANS`.
         engine: Default `VariationalEngine()`.
 
     Raises:
-        ValueError: If timesteps do not fit, or `scene` is missing.
+        ValueError: If timesteps do not fit.
     """
     began, engine = time.perf_counter(), checked_engine(engine)
-    ilqr = checked_optional("ilqr", ilqr, TrajectoryOptions) or NEW_PLANS
-    _check(plant, state, task, plan, scene, substeps, every)
-    finer = 1 if scene is None else _substeps("scene", scene, plan)
+    _check(plant, state, task, plan)
+    checked_optional("replanning", replanning, Replanning)
+    substeps = _substeps("plant", plant, plan)
+    finer = 1 if replanning is None else _substeps("replanning.scene", replanning.scene, plan)
     scales, n_steps = Scales.of(task), task.n_steps
-    length = every or n_steps
+    length = n_steps if replanning is None else replanning.every
     nominal = jax.tree.map(lambda x: x[:-1], plan.trajectory.states)
     now, values, gains = plant.filled(state), plan.values, plan.gains
     pieces: list[State] = []
@@ -114,9 +114,8 @@ def follow(
     replans: list[Replan] = []
     solved = True
     for step in range(0, n_steps, length):
-        if step and scene is not None:
-            guess = scales.scaled(values)
-            solution, replan = _again(scene, task, engine, now, guess, step, finer, ilqr)
+        if step and replanning is not None:
+            solution, replan = _again(replanning, task, engine, now, scales.scaled(values), step, finer)
             replans.append(replan)
             values = scales.physical(solution.controls)
             gains = solution.gains * scales.width[None, :, None]
@@ -142,19 +141,20 @@ def follow(
 
 
 def _again(
-    scene: Scene,
+    replanning: Replanning,
     task: Task,
     engine: AbstractEngine,
     now: State,
     guess: Float[Array, "T m"],
     step: int,
     substeps: int,
-    ilqr: TrajectoryOptions,
 ) -> tuple[TrajectorySolution, Replan]:
     """A plan from a step of the task on, at the front of the arrays."""
     began = time.perf_counter()
-    problem = problem_of(scene, task, engine, task.n_steps - step, substeps)
-    solution = optimal_trajectory(problem, now, guess, options=ilqr, compiler_options=compiler_options())
+    problem = problem_of(replanning.scene, task, engine, task.n_steps - step, substeps)
+    solution = optimal_trajectory(
+        problem, now, guess, options=replanning.ilqr, compiler_options=compiler_options()
+    )
     reached = all(violation.amount <= VIOLATION for violation in solution.violations)
     return solution, Replan(step, reached, time.perf_counter() - began)
 
@@ -187,25 +187,12 @@ def _run(plant: Scene, task: Task, engine, start: State, rows, feedback, substep
     return flat, used, jnp.all(good)
 
 
-def _check(
-    plant: Scene, state: State, task: Task, plan: Plan, scene: Scene | None, substeps: int, every
-) -> None:
+def _check(plant: Scene, state: State, task: Task, plan: Plan) -> None:
     checked_kind("plant", plant, Scene).check_state(state)
     checked_kind("task", task, Task).check(plant)
     checked_kind("plan", plan, Plan)
-    checked_optional("scene", scene, Scene)
-    checked_count("substeps", substeps)
-    if every is not None:
-        checked_count("every", every)
-    if every is not None and scene is None:
-        raise ValueError("scene must be given with every: new plans are made in it")
     if len(plan.values) != task.n_steps:
         raise ValueError(f"plan must have the task's {task.n_steps} steps, got {len(plan.values)}")
-    if _substeps("plant", plant, plan) != substeps:
-        raise ValueError(
-            f"substeps must be {_substeps('plant', plant, plan)}, the plan's timestep divided by that of "
-            f"plant, got {substeps}"
-        )
 
 
 def _substeps(name: str, scene: Scene, plan: Plan) -> int:

@@ -39,21 +39,13 @@ METHODS = ("ilqr", "cem", "mppi")
 
 
 class GoalError(NamedTuple):
-    """How a goal was reached.
+    """How a goal was reached."""
 
-    Attributes:
-        name: Such as "position of bunny".
-        error: Length of the difference to the goal [unit of the quantity; rad].
-        largest: Its largest component.
-        within: What counts as reached.
-        required: Whether it had to be.
-    """
-
-    name: str
-    error: float
-    largest: float
-    within: float
-    required: bool
+    name: str  # Such as "position of bunny"
+    error: float  # Length of the difference to the goal [unit of the quantity; rad]
+    largest: float  # Its largest component
+    within: float  # What counts as reached
+    required: bool  # Whether it had to be
 
     @property
     def reached(self) -> bool:
@@ -63,41 +55,25 @@ class GoalError(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """Controls that do a task, what comes of them, and what does not.
+    """Controls that do a task, what comes of them, and what does not."""
 
-    Attributes:
-        controls: For `dano.simulate`, leaves of shape (T, …).
-        values: Controls of the task's actuators [N, N m], shape (T, m).
-        trajectory: What the scene does under them.
-        gains: K [N or N m per unit of a state's coordinate], shape (T, m, n): feedback that holds the bodies
-            on the trajectory. Zero from sampling.
-        cost: J, without what constraints cost.
-        goals: How each goal was reached at the end of `trajectory`.
-        limits: Name, worst excess and its step of each limit of the task.
-        reached: Whether all required goals and all limits are met.
-        message: Why the search ended, in words.
-        method: Of the search.
-        seconds: Time it took, with compilation [s].
-        distances: Length of every goal's error over time [unit of its quantity; rad], by its name, shape
-            (T + 1,).
-        solution: What the solver says; None from sampling.
-        explored: That and why contact was looked for, in words; empty if it was not.
-    """
-
-    controls: Control
-    values: Float[Array, "T m"]
-    trajectory: Trajectory
+    controls: Control  # For `dano.simulate`, leaves of shape (T, …)
+    values: Float[Array, "T m"]  # Controls of the task's actuators [N, N m], shape (T, m)
+    trajectory: Trajectory  # What the scene does under them
+    # K [N or N m per unit of a state's coordinate], shape (T, m, n): feedback that holds the bodies on the
+    # trajectory. Zero from sampling.
     gains: Float[Array, "T m n"]
-    cost: float
-    goals: tuple[GoalError, ...]
-    limits: tuple[tuple[str, float, int], ...]
-    reached: bool
-    message: str
-    method: str
-    seconds: float
+    cost: float  # J, without what constraints cost
+    goals: tuple[GoalError, ...]  # How each goal was reached at the end of `trajectory`
+    limits: tuple[tuple[str, float, int], ...]  # Name, worst excess and its step of each limit of the task
+    reached: bool  # Whether all required goals and all limits are met
+    message: str  # Why the search ended, in words
+    method: str  # Of the search
+    seconds: float  # Time it took, with compilation [s]
+    # Length of every goal's error over time [unit of its quantity; rad], by its name, shape (T + 1,).
     distances: dict[str, np.ndarray]
-    solution: solvers.TrajectorySolution | None = None
-    explored: str = ""
+    solution: solvers.TrajectorySolution | None = None  # What the solver says; None from sampling
+    explored: str = ""  # That and why contact was looked for, in words; empty if it was not
 
     def describe(self) -> str:
         """The plan in a few lines."""
@@ -171,8 +147,7 @@ def plan(
     task: Task,
     *,
     method: str = "ilqr",
-    controls: Float[Array, "T m"] | np.ndarray | None = None,
-    warm: Plan | None = None,
+    controls: Float[Array, "T m"] | np.ndarray | Plan | None = None,
     options: PlanOptions | None = None,
     engine: AbstractEngine | None = None,
     callback: Callable[[str, int, float], object] | None = None,
@@ -189,8 +164,8 @@ def plan(
         state: Where it begins.
         task: Goals, limits and actuators.
         method: How to search: "ilqr", "cem" or "mppi".
-        controls: First guess [N, N m], shape (T, m); default: zero.
-        warm: Plan of a similar problem: its controls and multipliers are the first guess.
+        controls: First guess [N, N m], shape (T, m), or a plan of a similar problem, whose multipliers are
+            taken, too; default: zero.
         options: How the search runs; default `PlanOptions()`.
         engine: Default `VariationalEngine()`.
         callback: Called with the stage, the iteration and the cost; if it returns True, the search stops.
@@ -206,15 +181,16 @@ def plan(
     scene.check_state(state)
     checks.checked_kind("task", task, Task).check(scene)
     checks.checked_choice("method", method, METHODS)
-    checks.checked_optional("warm", warm, Plan)
     options = checks.checked_optional("options", options, PlanOptions) or PlanOptions()
     if callback is not None:
         checks.checked_function("callback", callback)
     engine, state = checked_engine(engine), scene.filled(state)
     scales = Scales.of(task)
-    guess = scales.scaled(_first_guess(task, controls, warm))
+    guess = scales.scaled(_first_guess(task, controls))
     problem = problem_of(scene, task, engine)
     tell = callback or (lambda stage, iteration, cost: None)
+    warm = controls.solution if isinstance(controls, Plan) else None
+    given = _Given(scene, state, task, engine, warm, options, tell, began)
     if method != "ilqr" or options.explore:
         search = options.sampling
         if method == "ilqr":
@@ -232,8 +208,7 @@ def plan(
         guess = found.controls
         if method != "ilqr":
             why = "interrupted" if found.interrupted else f"all {search.passes} passes of sampling were made"
-            return _plan(scene, state, task, scales, engine, guess, None, why, method, began)
-    given = _Given(scene, state, task, engine, warm, options, tell)
+            return _plan(given, guess, None, why, method)
     why, solution = "", None
     if options.explore is None:
         why, solution = _explored(given, problem, guess, scales)
@@ -243,7 +218,7 @@ def plan(
     message = solution.stop.value
     if solution.stop is solvers.TrajectoryStop.INFEASIBLE:
         message += f"{_what_is_missed(solution)}; {_worth(given, problem, solution).summary}"
-    made = _plan(scene, state, task, scales, engine, solution.controls, solution, message, method, began)
+    made = _plan(given, solution.controls, solution, message, method)
     return dataclasses.replace(made, explored=why)
 
 
@@ -254,15 +229,14 @@ class _Given(NamedTuple):
     state: State
     task: Task
     engine: AbstractEngine
-    warm: Plan | None
+    warm: solvers.TrajectorySolution | None  # That of a similar problem
     options: PlanOptions
     tell: Callable[[str, int, float], object]
+    began: float  # When [s]
 
     def optimised(self, guess: Array, penalty: float = 0.0) -> solvers.TrajectorySolution:
         """The best trajectory near that of a guess; `penalty` is the least one to begin with."""
-        multipliers = None
-        if self.warm is not None and self.warm.solution is not None:
-            multipliers = self.warm.solution.multipliers
+        multipliers = None if self.warm is None else self.warm.multipliers
         began = time.perf_counter()
         stages = [
             (f"optimising with {f:g} of the stiffness", softened(self.scene, f))
@@ -356,11 +330,13 @@ def _violation(solution: solvers.TrajectorySolution) -> float:
     return max((violation.amount for violation in solution.violations), default=0.0)
 
 
-def _first_guess(task: Task, controls: Any, warm: Plan | None) -> Array:
+def _first_guess(task: Task, controls: Any) -> Array:
     lower, _ = task.bounds()
     shape = (task.n_steps, lower.size)
     if controls is None:
-        controls = np.zeros(shape) if warm is None else warm.values
+        controls = np.zeros(shape)
+    elif isinstance(controls, Plan):
+        controls = controls.values
     return checked_array("controls", controls, shape)
 
 
@@ -369,12 +345,16 @@ def _what_is_missed(solution: solvers.TrajectorySolution) -> str:
     return f"; not met: {', '.join(missed)}" if missed else ""
 
 
-def _plan(scene, state, task, scales, engine, w, solution, message, method, began) -> Plan:
+def _plan(
+    given: _Given, w: Array, solution: solvers.TrajectorySolution | None, message: str, method: str
+) -> Plan:
+    """What comes of controls w, in shares of their bounds."""
+    scene, task, engine, scales = given.scene, given.task, given.engine, Scales.of(given.task)
     values = scales.physical(jnp.asarray(w))
     lower, upper = task.bounds()
     # The last digit of a scaled bound may lie beyond it.
     values = jnp.clip(values, *(jnp.broadcast_to(bound, values.shape) for bound in (lower, upper)))
-    controls, trajectory = _rolled(scene, state, task, engine, values)
+    controls, trajectory = _rolled(scene, given.state, task, engine, values)
     n = 12 * len(scene.layout.free) + 2 * scene.layout.n_joints
     gains = (
         jnp.zeros((*values.shape, n)) if solution is None else solution.gains * scales.width[None, :, None]
@@ -387,7 +367,7 @@ def _plan(scene, state, task, scales, engine, w, solution, message, method, bega
     met = met and all(excess <= VIOLATION for _, excess, _ in limits)
     rows = zip(task.goals, errors, strict=True)
     distances = {goal.name: np.linalg.norm(np.asarray(error), axis=1) for goal, error in rows}
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - given.began
     return Plan(
         controls,
         values,

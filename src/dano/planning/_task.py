@@ -20,24 +20,18 @@ _AXES = "xyz"
 
 
 class Actuator(eqx.Module):
-    """A force, a torque, a joint's effort or its motor's command that the plan may choose.
+    """A force, a torque, a joint's effort or its motor's command that the plan may choose."""
 
-    Attributes:
-        body: Name of the body; for an effort or a command the one that hangs on the joint.
-        kind: "force" at the centre of mass [N, W], "torque" [N m, W], "effort" of a joint [N m or N], or
-            "command" of its motor, see `dano.Motor`.
-        axes: Which components of a force or a torque it has, e.g. "xy" (static).
-        lower: Least values, shape (number of axes,).
-        upper: Largest values.
-        cost: Price of its squares [1/(N² s)] or [1/(N² m² s)].
-    """
-
+    # Name of the body; for an effort or a command the one that hangs on the joint.
     body: str = eqx.field(static=True)
+    # "force" at the centre of mass [N, W], "torque" [N m, W], "effort" of a joint [N m or N], or "command" of
+    # its motor, see `dano.Motor`.
     kind: str = eqx.field(static=True)
+    # Which components of a force or a torque it has, e.g. "xy" (static).
     axes: str = eqx.field(static=True)
-    lower: Float[Array, " m"]
-    upper: Float[Array, " m"]
-    cost: Float[Array, ""]
+    lower: Float[Array, " m"]  # Least values, shape (number of axes,)
+    upper: Float[Array, " m"]  # Largest values
+    cost: Float[Array, ""]  # Price of its squares [1/(N² s)] or [1/(N² m² s)]
 
     def __init__(
         self,
@@ -108,26 +102,18 @@ class Goal(eqx.Module):
     A goal costs ½ w |e|² per second on the way and ½ w_T |e|² at the end, and if it is required the plan
     must reach it: |e_i| ≤ within for each component. e is the difference to the value; for orientations the
     rotation vector [rad] from the goal to the body, in the goal's frame.
-
-    Attributes:
-        body: Name of the body; for q and v the one that hangs on the joint.
-        quantity: "position" [m, W], "orientation", "velocity" [m/s, W], "omega" [rad/s, B], "q" or "v".
-        value: What it shall become.
-        axes: Which components count, e.g. "xy" (static); for orientations components of e.
-        running: w [1/(unit² s)].
-        final: w_T [1/unit²].
-        required: Whether the plan must reach it (static).
-        within: How near counts as reached [unit].
     """
 
-    body: str = eqx.field(static=True)
+    body: str = eqx.field(static=True)  # Name of the body; for q and v the one that hangs on the joint
+    # "position" [m, W], "orientation", "velocity" [m/s, W], "omega" [rad/s, B], "q" or "v".
     quantity: str = eqx.field(static=True)
-    value: Float[Array, " n"]
+    value: Float[Array, " n"]  # What it shall become
+    # Which components count, e.g. "xy" (static); for orientations components of e.
     axes: str = eqx.field(static=True)
-    running: Float[Array, ""]
-    final: Float[Array, ""]
-    required: bool = eqx.field(static=True)
-    within: Float[Array, ""]
+    running: Float[Array, ""]  # w [1/(unit² s)]
+    final: Float[Array, ""]  # w_T [1/unit²]
+    required: bool = eqx.field(static=True)  # Whether the plan must reach it (static)
+    within: Float[Array, ""]  # How near counts as reached [unit]
 
     def __init__(
         self,

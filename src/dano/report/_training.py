@@ -156,17 +156,11 @@ _SIDE = 224
 
 
 class MassEstimates(NamedTuple):
-    """Mass properties of the same object by three ways, for the same mass.
+    """Mass properties of the same object by three ways, for the same mass."""
 
-    Attributes:
-        hull: Of the visual hull of the silhouettes.
-        fill: Of the density's level set, cavities filled: those of the neural object.
-        occupancy: Of φ itself, as a mass density.
-    """
-
-    hull: MassProperties
-    fill: MassProperties
-    occupancy: MassProperties
+    hull: MassProperties  # Of the visual hull of the silhouettes
+    fill: MassProperties  # Of the density's level set, cavities filled: those of the neural object
+    occupancy: MassProperties  # Of φ itself, as a mass density
 
     def differences(self, size: float) -> dict[str, dict[str, float]]:
         """Of `hull` and `occupancy` from `fill`: COM as a share of `size` [m], principal inertias."""

@@ -16,7 +16,7 @@ from dano.names import did_you_mean
 from dano.robots._loops import close_loops, loop_gaps
 from dano.robots._robot import check_arguments, Robot
 from dano.scene import Scene, State
-from dano.solvers import bounded_least_squares, NormalEquations
+from dano.solvers import bounded_least_squares, LeastSquaresOptions, NormalEquations
 
 # What a gap in a loop counts for, beside a target's distance.
 _LOOPS = 100.0
@@ -71,26 +71,17 @@ class Target(eqx.Module):
 
 
 class InverseKinematics(NamedTuple):
-    """What inverse kinematics found.
+    """What inverse kinematics found."""
 
-    Attributes:
-        state: The state, which rests.
-        reached: Whether all targets are met to 0.1 mm and 1e-3 rad.
-        position_errors: Distance of each target [m]; NaN where it has no position.
-        angle_errors: Angle of each target [rad]; NaN where it has no orientation.
-        at_limits: Coordinates that lie on a limit.
-        singular: Whether the arm is where some motion of the links needs infinite speeds of the joints, e.g.
-            stretched, or with two axes in line.
-        reason: Which target was missed, by how much and why, or why the search ended.
-    """
-
-    state: State
-    reached: bool
-    position_errors: np.ndarray
-    angle_errors: np.ndarray
-    at_limits: tuple[int, ...]
+    state: State  # The state, which rests
+    reached: bool  # Whether all targets are met to 0.1 mm and 1e-3 rad
+    position_errors: np.ndarray  # Distance of each target [m]; NaN where it has no position
+    angle_errors: np.ndarray  # Angle of each target [rad]; NaN where it has no orientation
+    at_limits: tuple[int, ...]  # Coordinates that lie on a limit
+    # Whether the arm is where some motion of the links needs infinite speeds of the joints, e.g. stretched,
+    # or with two axes in line.
     singular: bool
-    reason: str
+    reason: str  # Which target was missed, by how much and why, or why the search ended
 
 
 def inverse_kinematics(
@@ -149,9 +140,8 @@ def inverse_kinematics(
         empty = (np.zeros((0, 0)), np.zeros((0, 0, 0)), np.zeros((0, 0, k)), none.ravel())
         return NormalEquations(0.5 * float(residual @ residual), rows.T @ residual, rows.T @ rows, *empty)
 
-    solution = bounded_least_squares(
-        linearize, start, lower=lower, upper=upper, max_iterations=max_iterations, tolerance=1e-12
-    )
+    options = LeastSquaresOptions(max_iterations, tolerance=1e-12)
+    solution = bounded_least_squares(linearize, start, lower=lower, upper=upper, options=options)
     found = scene.filled(dataclasses.replace(resting, q=jnp.asarray(solution.x, dtype)))
     found = close_loops(scene, found) if scene.loops else found
     errors = np.array([_errors(robot, scene, found, target) for target in targets])

@@ -23,29 +23,20 @@ _FASTEST = 0.5
 
 
 class JointPD(eqx.Module):
-    """A controller of a robot's joints: see `pd`. For `dano.simulate(controls=…)`.
+    """A controller of a robot's joints: see `pd`. For `dano.simulate(controls=…)`."""
 
-    Attributes:
-        scene: The scene that the controller takes the world to be.
-        goal: Coordinates [rad or m], shape (k,), or a function of time that gives them.
-        stiffness: k_p [N m/rad or N/m], shape (k,); None: in proportion to the mass matrix.
-        damping: k_d [N m s/rad or N s/m], shape (k,); None likewise.
-        rate: ω of gains in proportion to the mass matrix [rad/s].
-        most: Largest effort of each joint [N m or N], shape (k,).
-        gravity: Whether gravity is compensated (static).
-        places: Of the joints among the coordinates q of the scene (static).
-        names: Of the joints (static).
-    """
-
-    scene: Scene
+    scene: Scene  # The scene that the controller takes the world to be
+    # Coordinates [rad or m], shape (k,), or a function of time that gives them.
     goal: Float[Array, " k"] | Callable[[Float[Array, ""]], Goal]
+    # k_p [N m/rad or N/m], shape (k,); None: in proportion to the mass matrix.
     stiffness: Float[Array, " k"] | None
-    damping: Float[Array, " k"] | None
-    rate: float = eqx.field(static=True)
-    most: Float[Array, " k"]
-    gravity: bool = eqx.field(static=True)
+    damping: Float[Array, " k"] | None  # k_d [N m s/rad or N s/m], shape (k,); None likewise
+    rate: float = eqx.field(static=True)  # ω of gains in proportion to the mass matrix [rad/s]
+    most: Float[Array, " k"]  # Largest effort of each joint [N m or N], shape (k,)
+    gravity: bool = eqx.field(static=True)  # Whether gravity is compensated (static)
+    # Of the joints among the coordinates q of the scene (static).
     places: tuple[int, ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # Of the joints (static)
 
     def __call__(self, state: State, time: Float[Array, ""]) -> Control:
         """Efforts of the step that begins at `time` [s]."""

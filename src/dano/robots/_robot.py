@@ -34,43 +34,33 @@ PLANE = " plane"
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot as parts of a scene. Links that are welded together are one body, named after the first.
+    """A robot as parts of a scene. Links that are welded together are one body, named after the first."""
 
-    Attributes:
-        name: Of the robot.
-        bodies: One for each group of links that moves as one; the base, too, if it floats or has a shape, and
-            what the file has in the world.
-        joints: Between them, in the order of the file.
-        joint_names: Of those with coordinates of their own: the file's names, by the body that hangs on each.
-        frames: Of each link of the file: its body (None for the world), position [m] and orientation wxyz in
-            that body's field frame.
-        base: Position [m, W] and orientation of the base, or None if it floats.
-        efforts: Largest torque or force of each joint with coordinates [N m or N], by its name in the file.
-        touching: Bodies that have a shape of their own to touch with.
-        description: What the file says.
-        loops: What closes chains of its joints.
-        places: Position [m, W] and orientation of the frames of bodies that hang on no joint, in the pose of
-            the file.
-        home: Coordinates of the joints in that pose, by their names in the file [rad or m].
-        gravity: Of the file [m/s²]; None if its format has none.
-        drives: Joint and numbers of each actuator of the file, by its name.
-        surroundings: Bodies that stand in the file's world, and on which no joint hangs, such as a floor.
-    """
-
-    name: str
+    name: str  # Of the robot
+    # One for each group of links that moves as one; the base, too, if it floats or has a shape, and what the
+    # file has in the world.
     bodies: tuple[Body, ...]
-    joints: tuple[Joint, ...]
+    joints: tuple[Joint, ...]  # Between them, in the order of the file
+    # Of those with coordinates of their own: the file's names, by the body that hangs on each.
     joint_names: dict[str, str]
+    # Of each link of the file: its body (None for the world), position [m] and orientation wxyz in that
+    # body's field frame.
     frames: dict[str, tuple[str | None, np.ndarray, np.ndarray]]
+    # Position [m, W] and orientation of the base, or None if it floats.
     base: tuple[np.ndarray, np.ndarray] | None
+    # Largest torque or force of each joint with coordinates [N m or N], by its name in the file.
     efforts: dict[str, float]
-    touching: tuple[str, ...]
-    description: Description
-    loops: tuple[Loop, ...] = ()
+    touching: tuple[str, ...]  # Bodies that have a shape of their own to touch with
+    description: Description  # What the file says
+    loops: tuple[Loop, ...] = ()  # What closes chains of its joints
+    # Position [m, W] and orientation of the frames of bodies that hang on no joint, in the pose of the file.
     places: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    # Coordinates of the joints in that pose, by their names in the file [rad or m].
     home: dict[str, float] = field(default_factory=dict)
-    gravity: tuple[float, float, float] | None = None
+    gravity: tuple[float, float, float] | None = None  # Of the file [m/s²]; None if its format has none
+    # Joint and numbers of each actuator of the file, by its name.
     drives: dict[str, tuple[str, Drive]] = field(default_factory=dict)
+    # Bodies that stand in the file's world, and on which no joint hangs, such as a floor.
     surroundings: tuple[str, ...] = ()
 
     @property

@@ -8,11 +8,12 @@ from dano.scene._contacts import (
 )
 from dano.scene._doubts import (
     box_volume as box_volume,
-    Doubt as Doubt,
     say_doubts as say_doubts,
+    SceneDoubt as SceneDoubt,
     SceneWarning as SceneWarning,
 )
 from dano.scene._frames import (
+    BodyPoses as BodyPoses,
     Chains as Chains,
     filled as filled,
     Frames as Frames,
@@ -20,7 +21,6 @@ from dano.scene._frames import (
     link_jacobian as link_jacobian,
     place_links as place_links,
     plane_axes as plane_axes,
-    Poses as Poses,
     RESOLVED as RESOLVED,
     step_twists as step_twists,
     triples as triples,
@@ -29,9 +29,9 @@ from dano.scene._joints import (
     Joint as Joint,
     JOINT_KINDS as JOINT_KINDS,
     JointLaws as JointLaws,
-    Layout as Layout,
     Motor as Motor,
     MOTOR_KINDS as MOTOR_KINDS,
+    StateLayout as StateLayout,
 )
 from dano.scene._loops import Loop as Loop, LOOP_KINDS as LOOP_KINDS, Loops as Loops
 from dano.scene._others import (

@@ -35,50 +35,35 @@ _ARGUMENTS = (
 
 
 class Body(eqx.Module):
-    """A rigid body: geometry, mass properties, and a name.
+    """A rigid body: geometry, mass properties, and a name."""
 
-    Attributes:
-        name: Unique name in its scene.
-        shape: Primitive shape, or None for a neural object.
-        object: Neural object, or None for a shape.
-        samples: Contact samples in the layout of the contact kernels, or None for a shape without them.
-        support: Culling map of the object's grid.
-        surface: Surface samples with vector areas, for distributed contact; None until a scene needs those of
-            a shape.
-        extent: Centre of a ball around the body [m, F], its radius [m] (infinite for a half-space), the
-            body's largest extent and its largest depth below the surface [m]; None until a scene needs it.
-        density_scale: Makes the object's density dimensionless in neural–neural contacts: one over the mean
-            density of its samples.
-        mass: [kg].
-        inertia: Tensor about the centre of mass [kg m², B].
-        com: Centre of mass in the field frame [m, F].
-        mass_scale: Multiplies mass and inertia [1].
-        com_offset: Moves the centre of mass [m, F].
-        material: Contact parameters for pairs that no contact of a scene names; None: the scene's.
-        gravcomp: Share of the weight that is held, as by a spring balance [1]; None: none.
-        fixed: Whether the body never moves.
-        weighed: Whether its mass is known (static).
-        start: Where `Scene.initial_state` puts it if nothing else is said: some of `position, orientation,
-            velocity, omega, origin, q, v`.
-    """
-
-    name: str = eqx.field(static=True)
-    shape: fields.AbstractShape | None
-    object: objects.NeuralObject | None
+    name: str = eqx.field(static=True)  # Unique name in its scene
+    shape: fields.AbstractShape | None  # Primitive shape, or None for a neural object
+    object: objects.NeuralObject | None  # Neural object, or None for a shape
+    # Contact samples in the layout of the contact kernels, or None for a shape without them.
     samples: contact.SampleSet | None
-    support: contact.Support | None
+    support: contact.Support | None  # Culling map of the object's grid
+    # Surface samples with vector areas, for distributed contact; None until a scene needs those of a shape.
     surface: contact.SurfaceSet | None
+    # Centre of a ball around the body [m, F], its radius [m] (infinite for a half-space), the body's largest
+    # extent and its largest depth below the surface [m]; None until a scene needs it.
     extent: Float[Array, "6"] | None
+    # Makes the object's density dimensionless in neural–neural contacts: one over the mean density of its
+    # samples.
     density_scale: Float[Array, ""]
-    mass: Float[Array, ""]
-    inertia: Float[Array, "3 3"]
-    com: Float[Array, "3"]
-    mass_scale: Float[Array, ""]
-    com_offset: Float[Array, "3"]
+    mass: Float[Array, ""]  # [kg]
+    inertia: Float[Array, "3 3"]  # Tensor about the centre of mass [kg m², B]
+    com: Float[Array, "3"]  # Centre of mass in the field frame [m, F]
+    mass_scale: Float[Array, ""]  # Multiplies mass and inertia [1]
+    com_offset: Float[Array, "3"]  # Moves the centre of mass [m, F]
+    # Contact parameters for pairs that no contact of a scene names; None: the scene's.
     material: contact.ContactParams | None
+    # Share of the weight that is held, as by a spring balance [1]; None: none.
     gravcomp: Float[Array, ""] | None
-    fixed: bool = eqx.field(static=True)
-    weighed: bool = eqx.field(static=True)
+    fixed: bool = eqx.field(static=True)  # Whether the body never moves
+    weighed: bool = eqx.field(static=True)  # Whether its mass is known (static)
+    # Where `Scene.initial_state` puts it if nothing else is said: some of `position, orientation, velocity,
+    # omega, origin, q, v`.
     start: dict[str, Array]
 
     def __init__(

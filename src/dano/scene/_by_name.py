@@ -19,7 +19,7 @@ from dano.maths import (
     stacked,
 )
 from dano.scene._bodies import Body, check_once
-from dano.scene._joints import Joint, Layout
+from dano.scene._joints import Joint, StateLayout
 from dano.scene._states import JOINT_QUANTITIES, STATE_SIZES
 
 ByName = Mapping[str, Mapping[str, Numbers]]
@@ -67,7 +67,7 @@ def started(bodies: Sequence[Body], given: ByName) -> ByName:
 
 
 def state_arrays(
-    bodies: Sequence[Body], layout: Layout, given: ByName, dtype: DTypeLike
+    bodies: Sequence[Body], layout: StateLayout, given: ByName, dtype: DTypeLike
 ) -> dict[str, Float[Array, "n _"]]:
     """Rows of all bodies, by quantity; those that are not given rest at the origin.
 
@@ -113,7 +113,7 @@ def _in_body(spin: Q, orientation: Q) -> Q:
 
 
 def control_arrays(
-    bodies: Sequence[Body], joints: Sequence[Joint], layout: Layout, given: ByName, dtype: DTypeLike
+    bodies: Sequence[Body], joints: Sequence[Joint], layout: StateLayout, given: ByName, dtype: DTypeLike
 ) -> dict[str, Float[Array, "n 3"]]:
     """Forces and torques of all bodies, zero by default.
 
@@ -169,7 +169,7 @@ def _numbers(what: str, name: str, given: ByName) -> Mapping[str, Numbers]:
     return numbers
 
 
-def _state_keys(layout: Layout, body: int) -> list[str]:
+def _state_keys(layout: StateLayout, body: int) -> list[str]:
     """What the state of a body is given by."""
     joint = layout.joint_of(body)
     if joint is None:

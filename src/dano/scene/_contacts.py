@@ -38,19 +38,13 @@ class Contact(eqx.Module):
     The default law is `DistributedLaw`: pressure, friction and restitution at every surface sample. The law
     of the paper, one wrench at the centroid of the overlap, is `law=CentroidLaw()`; it reads other
     parameters.
-
-    Attributes:
-        a: Name of the first body; the patch normal points from b to a.
-        b: Name of the second body.
-        params: Parameters of the law; a scene fills in those that are None.
-        law: The law.
-        edge: Width of the smooth occupancy of a primitive in this pair [m]; None until a scene resolves it.
     """
 
-    a: str = eqx.field(static=True)
-    b: str = eqx.field(static=True)
-    params: ContactParams
-    law: AbstractContactLaw
+    a: str = eqx.field(static=True)  # Name of the first body; the patch normal points from b to a
+    b: str = eqx.field(static=True)  # Name of the second body
+    params: ContactParams  # Parameters of the law; a scene fills in those that are None
+    law: AbstractContactLaw  # The law
+    # Width of the smooth occupancy of a primitive in this pair [m]; None until a scene resolves it.
     edge: Float[Array, ""] | None
 
     def __init__(

@@ -18,7 +18,7 @@ from dano.names import see
 from dano.scene._bodies import Body, by_geometry, sizes_of
 from dano.scene._contacts import Contact
 from dano.scene._frames import RESOLVED
-from dano.scene._joints import Joint, Layout
+from dano.scene._joints import Joint, StateLayout
 from dano.scene._states import State
 
 MOST_SAID = 3
@@ -52,25 +52,19 @@ _DEEP = 0.1
 """Share of its thickness by which a body may begin in a fixed one; at rest it is less than a hundredth."""
 
 
-class Doubt(NamedTuple):
-    """Something odd.
+class SceneDoubt(NamedTuple):
+    """Something odd."""
 
-    Attributes:
-        rank: The lowest is said first.
-        text: In one line.
-        subject: "sizes": units, frames and slips; "spin" or "start".
-    """
-
-    rank: int
-    text: str
-    subject: str = "sizes"
+    rank: int  # The lowest is said first
+    text: str  # In one line
+    subject: str = "sizes"  # "sizes": units, frames and slips; "spin" or "start"
 
 
 class SceneWarning(UserWarning):
     """Something odd about a scene or a state, which is made all the same."""
 
 
-def say_doubts(doubts: Sequence[Doubt], stacklevel: int) -> None:
+def say_doubts(doubts: Sequence[SceneDoubt], stacklevel: int) -> None:
     """Warn of the worst, and of how many more there are."""
     ordered = sorted(doubts)
     for place, doubt in enumerate(ordered[:MOST_SAID]):
@@ -85,7 +79,7 @@ def doubts_of_scene(
     contacts: Sequence[Contact],
     gravity: Float[Array, "3"],
     meeting: Collection[str],
-) -> list[Doubt]:
+) -> list[SceneDoubt]:
     """What is odd about what stays constant.
 
     Args:
@@ -100,14 +94,14 @@ def doubts_of_scene(
     seen = linked - set(meeting)
     found = []
     if len(bodies) > 1 and all(body.fixed for body in bodies):
-        found.append(Doubt(2, "nothing moves: all bodies are fixed"))
+        found.append(SceneDoubt(2, "nothing moves: all bodies are fixed"))
     for contact in contacts:
         mu = contact.params.sliding_friction
         if not is_traced(mu) and float(mu) > _ROUGHEST:
             text = (
                 f"sliding_friction {float(mu):.3g} of {contact.a!r} and {contact.b!r} is more than any pair"
             )
-            found.append(Doubt(3, f"{text} has: it is a ratio of forces, not an angle"))
+            found.append(SceneDoubt(3, f"{text} has: it is a ratio of forces, not an angle"))
         found += _too_soft(contact, bodies, gravity)
     judged = [
         body
@@ -125,13 +119,13 @@ def doubts_of_scene(
             found += _of_joint(joint, None if joint.child in seen else by_name[joint.child])
     if not is_traced(gravity) and float(np.linalg.norm(np.asarray(gravity))) > _STRONGEST:
         strength = float(np.linalg.norm(np.asarray(gravity)))
-        found.append(Doubt(1, f"gravity is {strength:.4g} m/s²: that of the earth is 9.81"))
+        found.append(SceneDoubt(1, f"gravity is {strength:.4g} m/s²: that of the earth is 9.81"))
     if not is_traced(gravity) and float(gravity[2]) > 0 and float(abs(gravity[:2]).max()) == 0:
-        found.append(Doubt(1, f"gravity points up, {float(gravity[2]):.3g} m/s² along z: z is up"))
+        found.append(SceneDoubt(1, f"gravity points up, {float(gravity[2]):.3g} m/s² along z: z is up"))
     return found
 
 
-def _too_soft(contact: Contact, bodies: Sequence[Body], gravity: Float[Array, "3"]) -> list[Doubt]:
+def _too_soft(contact: Contact, bodies: Sequence[Body], gravity: Float[Array, "3"]) -> list[SceneDoubt]:
     """Whether a body sinks deep into what it rests on, by the stiffness that was given."""
     stiffness, found = contact.params.stiffness, []
     if stiffness is None or is_traced(stiffness, gravity):
@@ -145,7 +139,7 @@ def _too_soft(contact: Contact, bodies: Sequence[Body], gravity: Float[Array, "3
         other = contact.b if body.name == contact.a else contact.a
         if float(stiffness) * body.typical_support(_SOFT * body.size) < weight:
             found.append(
-                Doubt(
+                SceneDoubt(
                     3,
                     f"{body.name!r} sinks by more than {100 * _SOFT:.0f} % of its size where it rests: its"
                     f" stiffness of {float(stiffness):.3g} Pa/m with {other!r} is small",
@@ -196,27 +190,27 @@ def _bounds(body: Body) -> Float[np.ndarray, "2 3"]:
     return np.asarray(body.shape.bounds, np.float64)
 
 
-def _of_body(body: Body, box: Float[np.ndarray, "2 3"], size: float) -> list[Doubt]:
+def _of_body(body: Body, box: Float[np.ndarray, "2 3"], size: float) -> list[SceneDoubt]:
     """What is odd about a body, with the box around it [m, F] and its size [m]."""
     found = []
     if (text := density_doubt(body, box, size)) is not None:
-        found.append(Doubt(0, text))
+        found.append(SceneDoubt(0, text))
     elif _LONGEST < size < np.inf:
-        found.append(Doubt(0, f"{body.name!r} is {size:.3g} m long: are its lengths in metres?"))
+        found.append(SceneDoubt(0, f"{body.name!r} is {size:.3g} m long: are its lengths in metres?"))
     if (away := _beside(body, box)) > _FAR * size:
         text = (
             f"the centre of mass of {body.name!r} lies {away:.3g} m beside its shape, {away / size:.2g}"
             " times its size: it is a point of the body's own frame"
         )
-        found.append(Doubt(3, text))
+        found.append(SceneDoubt(3, text))
     thin = _thickness(body)
     edge = getattr(body.shape, "edge", None)
     if edge is not None and not is_traced(edge) and float(edge) > _WIDEST_EDGE * thin:
         text = f"the edge of {body.name!r} is {float(edge):.3g} m wide and its shape {thin:.3g} m thick"
-        found.append(Doubt(3, f"{text}: it has no inside"))
+        found.append(SceneDoubt(3, f"{text}: it has no inside"))
     if thin < _THINNEST * size:
         text = f"{body.name!r} is {thin:.2g} m thick and {size:.2g} m long: too thin for its samples"
-        found.append(Doubt(5, text))
+        found.append(SceneDoubt(5, text))
     return found
 
 
@@ -235,7 +229,7 @@ def _thickness(body: Body) -> float:
     return min((2 * float(np.min(np.asarray(getattr(body.shape, name)))) for name in names), default=np.inf)
 
 
-def _of_joint(joint: Joint, body: Body | None) -> list[Doubt]:
+def _of_joint(joint: Joint, body: Body | None) -> list[SceneDoubt]:
     """Limits in degrees, and anchors far from a body; None for one that is not judged by its shape."""
     found = []
     if joint.kind == "hinge" and joint.limits is not None:
@@ -245,7 +239,7 @@ def _of_joint(joint: Joint, body: Body | None) -> list[Doubt]:
         if whole and np.abs(finite).max() > _TURNS:
             turns = np.abs(finite).max() / (2 * np.pi)
             found.append(
-                Doubt(
+                SceneDoubt(
                     2,
                     f"limits of the hinge of {joint.child!r}, {ends[0]:g} to {ends[1]:g} rad, are"
                     f" {turns:.3g} turns: are they in degrees?",
@@ -260,7 +254,7 @@ def _of_joint(joint: Joint, body: Body | None) -> list[Doubt]:
         away = float(np.linalg.norm(anchor))
         if joint.kind != "weld" and away > _FAR * body.size:
             found.append(
-                Doubt(
+                SceneDoubt(
                     3,
                     f"the anchor of the joint of {joint.child!r} lies {away:.3g} m from the body's middle,"
                     f" {away / body.size:.2g} times its size: it is a point of the body's own frame",
@@ -272,10 +266,10 @@ def _of_joint(joint: Joint, body: Body | None) -> list[Doubt]:
 def doubts_of_state(
     bodies: Sequence[Body],
     pairs: Int[np.ndarray, "k 2"],
-    layout: Layout,
+    layout: StateLayout,
     state: State,
     timestep: float,
-) -> list[Doubt]:
+) -> list[SceneDoubt]:
     """What is odd about how bodies stand and move.
 
     Args:
@@ -296,11 +290,11 @@ def doubts_of_state(
         if np.isfinite(size) and far * rounding > _COARSE * size:
             apart = f"where numbers are {far * rounding:.1g} m apart"
             text = f"{body.name!r} lies {far:.3g} m from the origin, {apart}"
-            found.append(Doubt(2, f"{text}: is its position in metres?"))
+            found.append(SceneDoubt(2, f"{text}: is its position in metres?"))
         way = float(np.linalg.norm(speeds[i])) * timestep
         if np.isfinite(size) and way > _LEAPS * size and way > 0:
             found.append(
-                Doubt(
+                SceneDoubt(
                     1,
                     f"{body.name!r} goes {way:.3g} m in a step, {way / size:.2g} times its size: is its"
                     " velocity in m/s?",
@@ -309,7 +303,7 @@ def doubts_of_state(
         spin = float(np.linalg.norm(spins[i]))
         if spin * timestep > 2 * RESOLVED:
             found.append(
-                Doubt(
+                SceneDoubt(
                     1,
                     f"{body.name!r} turns by {math.degrees(spin * timestep):.0f}° in a step, more than 60°:"
                     f" its precession is not resolved; use a timestep of {2 * RESOLVED / spin:.2g} s, or is"
@@ -322,23 +316,23 @@ def doubts_of_state(
     if len(turns) and np.all(turns == np.array([0.0, 0.0, 0.0, 1.0])):
         names = ", ".join(repr(bodies[i].name) for i in layout.free[:3])
         text = f"orientation [0, 0, 0, 1] of {names} is a half turn about z: quaternions are wxyz"
-        found.append(Doubt(4, f"{text}, and no turn is [1, 0, 0, 0]"))
+        found.append(SceneDoubt(4, f"{text}, and no turn is [1, 0, 0, 0]"))
     found += _of_coordinates(bodies, layout, state)
     if timestep < _SHORTEST:
         text = (
             f"timestep {timestep:.3g} s is short: a second takes {1 / timestep:.2g} steps; is it in seconds?"
         )
-        found.append(Doubt(3, text))
+        found.append(SceneDoubt(3, text))
     for i, body in enumerate(bodies):
         if body.fixed and (np.any(speeds[i]) or np.any(spins[i])):
-            found.append(Doubt(3, f"{body.name!r} is fixed: the velocity of its state moves nothing"))
+            found.append(SceneDoubt(3, f"{body.name!r} is fixed: the velocity of its state moves nothing"))
     floors = [i for i, body in enumerate(bodies) if isinstance(body.shape, HalfSpace)]
     for i, j in pairs[np.isin(pairs, floors).any(axis=1)].tolist():
         found += _begins_inside(bodies, position, orientation, i, j)
     return found
 
 
-def _of_coordinates(bodies: Sequence[Body], layout: Layout, state: State) -> list[Doubt]:
+def _of_coordinates(bodies: Sequence[Body], layout: StateLayout, state: State) -> list[SceneDoubt]:
     """Angles of hinges that are rather in degrees."""
     found = []
     for joint, _, place in layout.dofs:
@@ -347,7 +341,7 @@ def _of_coordinates(bodies: Sequence[Body], layout: Layout, state: State) -> lis
         q = float(state.q[place])
         if abs(q) > _TURNS and q == round(q):
             name, turns = bodies[layout.children[joint]].name, abs(q) / (2 * np.pi)
-            found.append(Doubt(4, f"q of {name!r} is {q:g} rad, {turns:.3g} turns: is it in degrees?"))
+            found.append(SceneDoubt(4, f"q of {name!r} is {q:g} rad, {turns:.3g} turns: is it in degrees?"))
     return found
 
 
@@ -357,7 +351,7 @@ def _begins_inside(
     orientation: Float[np.ndarray, "n 4"],
     i: int,
     j: int,
-) -> list[Doubt]:
+) -> list[SceneDoubt]:
     """Whether a body's lowest point is far below a half-space."""
     found = []
     for k, other in ((i, j), (j, i)):
@@ -376,5 +370,5 @@ def _begins_inside(
             text = f"{body.name!r} begins {depth:.3g} m inside {floor.name!r}: it will be pushed out"
             if body.object is not None:
                 text += " (position is the centre of mass; origin= places the file's own origin)"
-            found.append(Doubt(1, f"{text}; {see('a-body-begins-inside-another')}", "start"))
+            found.append(SceneDoubt(1, f"{text}; {see('a-body-begins-inside-another')}", "start"))
     return found

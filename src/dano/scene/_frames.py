@@ -21,7 +21,7 @@ from dano.maths import (
     quat_rotate,
     with_rows,
 )
-from dano.scene._joints import Joint, joint_laws, JointLaws, Layout
+from dano.scene._joints import Joint, joint_laws, JointLaws, StateLayout
 from dano.scene._states import State, STATE_SIZES
 
 RESOLVED = 0.5
@@ -32,48 +32,30 @@ _MANY_JOINTS = 4
 
 
 class Frames(eqx.Module):
-    """Pose, twist and Jacobian of all n bodies of a scene.
+    """Pose, twist and Jacobian of all n bodies of a scene."""
 
-    Attributes:
-        position: Of the centres of mass [m, W], shape (n, 3).
-        orientation: Unit quaternions wxyz, body → world, shape (n, 4).
-        velocity: Of the centres of mass [m/s, W], shape (n, 3).
-        omega: Angular velocities [rad/s, B], shape (n, 3).
-        jacobian: (velocity, omega) per generalised velocity, shape (n, 6, k). Generalised velocities are
-            velocity [m/s, W] and omega [rad/s, B] of each body that moves freely, then those of the joints.
-    """
-
-    position: Float[Array, "n 3"]
-    orientation: Float[Array, "n 4"]
-    velocity: Float[Array, "n 3"]
-    omega: Float[Array, "n 3"]
+    position: Float[Array, "n 3"]  # Of the centres of mass [m, W], shape (n, 3)
+    orientation: Float[Array, "n 4"]  # Unit quaternions wxyz, body → world, shape (n, 4)
+    velocity: Float[Array, "n 3"]  # Of the centres of mass [m/s, W], shape (n, 3)
+    omega: Float[Array, "n 3"]  # Angular velocities [rad/s, B], shape (n, 3)
+    # (velocity, omega) per generalised velocity, shape (n, 6, k). Generalised velocities are velocity [m/s,
+    # W] and omega [rad/s, B] of each body that moves freely, then those of the joints.
     jacobian: Float[Array, "n 6 k"]
 
 
 class Chains(eqx.Module):
-    """The trees of a scene: layout, arrays over joints, and centres of mass of all bodies.
+    """The trees of a scene: layout, arrays over joints, and centres of mass of all bodies."""
 
-    Attributes:
-        layout: The layout.
-        axis: See `Joint`, as are the next five; shape (j, 3).
-        anchor: Points on the axes.
-        position: Origins at q = 0.
-        orientation: At q = 0.
-        ratio: Of joints that mimic others; 1 for all other joints. Shape (j,).
-        shift: The same; 0 for all other joints.
-        laws: What acts on the coordinates.
-        com: Centres of mass of all bodies [m, F].
-    """
-
-    layout: Layout = eqx.field(static=True)
-    axis: Float[AnyArray, "j 3"]
-    anchor: Float[AnyArray, "j 3"]
-    position: Float[AnyArray, "j 3"]
-    orientation: Float[AnyArray, "j 4"]
+    layout: StateLayout = eqx.field(static=True)  # The layout
+    axis: Float[AnyArray, "j 3"]  # See `Joint`, as are the next five; shape (j, 3)
+    anchor: Float[AnyArray, "j 3"]  # Points on the axes
+    position: Float[AnyArray, "j 3"]  # Origins at q = 0
+    orientation: Float[AnyArray, "j 4"]  # At q = 0
+    # Of joints that mimic others; 1 for all other joints. Shape (j,).
     ratio: Float[AnyArray, " j"]
-    shift: Float[AnyArray, " j"]
-    laws: JointLaws
-    com: Float[AnyArray, "n 3"]
+    shift: Float[AnyArray, " j"]  # The same; 0 for all other joints
+    laws: JointLaws  # What acts on the coordinates
+    com: Float[AnyArray, "n 3"]  # Centres of mass of all bodies [m, F]
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -110,23 +92,16 @@ class Chains(eqx.Module):
         return with_rows(whole, (places, places), whole[places, places] + armature)
 
 
-class Poses(NamedTuple):
-    """Poses of all bodies, and where the joints are.
+class BodyPoses(NamedTuple):
+    """Poses of all bodies, and where the joints are."""
 
-    Attributes:
-        position: Of the centres of mass [m, W].
-        orientation: wxyz.
-        axis: Of each joint [W], shape (j, 3).
-        pivot: A point on it [m, W], shape (j, 3).
-    """
-
-    position: Float[AnyArray, "n 3"]
-    orientation: Float[AnyArray, "n 4"]
-    axis: Float[AnyArray, "j 3"]
-    pivot: Float[AnyArray, "j 3"]
+    position: Float[AnyArray, "n 3"]  # Of the centres of mass [m, W]
+    orientation: Float[AnyArray, "n 4"]  # wxyz
+    axis: Float[AnyArray, "j 3"]  # Of each joint [W], shape (j, 3)
+    pivot: Float[AnyArray, "j 3"]  # A point on it [m, W], shape (j, 3)
 
 
-def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[AnyArray, "n 3"]) -> Chains:
+def chains_of(layout: StateLayout, joints: Sequence[Joint], com: Float[AnyArray, "n 3"]) -> Chains:
     """The trees of a scene, in the dtype of the centres of mass [m, F]."""
     names = {"axis": 3, "anchor": 3, "position": 3, "orientation": 4}
     xp = library(com, *jax.tree.leaves(joints))
@@ -146,7 +121,7 @@ def chains_of(layout: Layout, joints: Sequence[Joint], com: Float[AnyArray, "n 3
     )
 
 
-def joints_of(layout: Layout, kind: str) -> tuple[np.ndarray, np.ndarray]:
+def joints_of(layout: StateLayout, kind: str) -> tuple[np.ndarray, np.ndarray]:
     """Which joints are of a kind, and the first coordinate of each."""
     rows = [j for j, each in enumerate(layout.kinds) if each == kind]
     return np.array(rows, int), np.array([layout.coordinates[j] for j in rows], int)
@@ -162,7 +137,7 @@ def place_links(
     position: Float[AnyArray, "n 3"],
     orientation: Float[AnyArray, "n 4"],
     q: Float[AnyArray, " k"],
-) -> Poses:
+) -> BodyPoses:
     """Poses of all bodies from those of the roots and the joint coordinates.
 
     Args:
@@ -198,7 +173,7 @@ def place_links(
     placed = origin[:-1] + quat_rotate(turned, chains.com)
     # Bodies that hang on nothing stay where they are to the last digit.
     roots = np.array([i not in layout.children for i in range(layout.bodies)])[:, None]
-    return Poses(xp.where(roots, position, placed), turned, axis, pivot)
+    return BodyPoses(xp.where(roots, position, placed), turned, axis, pivot)
 
 
 def _descended(
@@ -270,7 +245,7 @@ def _descended(
     return jax.lax.scan(level, carry, (even, parents[even], joints, bodies))[0]
 
 
-def link_jacobian(chains: Chains, poses: Poses) -> Float[AnyArray, "n 6 k"]:
+def link_jacobian(chains: Chains, poses: BodyPoses) -> Float[AnyArray, "n 6 k"]:
     """Twists (velocity of the centre of mass, spin; W) of all bodies per generalised velocity.
 
     Generalised velocities are velocity and spin of the bodies that move freely, both in W, and those of the
@@ -307,12 +282,12 @@ def link_jacobian(chains: Chains, poses: Poses) -> Float[AnyArray, "n 6 k"]:
     return xp.concatenate([roots.reshape(n, 6, 6 * f), columns.transpose(0, 2, 1)], axis=2)
 
 
-def _turns(layout: Layout, joint: int, part: int) -> bool:
+def _turns(layout: StateLayout, joint: int, part: int) -> bool:
     kind = layout.kinds[joint]
     return kind in ("hinge", "ball") or (kind == "planar" and part == 2)
 
 
-def _directions(chains: Chains, poses: Poses) -> Float[AnyArray, "d 3"]:
+def _directions(chains: Chains, poses: BodyPoses) -> Float[AnyArray, "d 3"]:
     """Axis of each motion of the joints [W]."""
     layout = chains.layout
     directions = poses.axis[np.array([j for j, _, _ in layout.dofs], int)]
@@ -469,7 +444,7 @@ def frames_of(chains: Chains, state: State) -> tuple[Any, ...]:
         poses = place_links(chains, state.position, state.orientation, state.q)
     else:
         none = xp.zeros((0, 3), dtype)
-        poses = Poses(state.position, state.orientation, none, none)
+        poses = BodyPoses(state.position, state.orientation, none, none)
     jacobian = link_jacobian(chains, poses)
     free = np.array(layout.free, int)
     # Spins of free bodies are given in B, all spins are returned in B.

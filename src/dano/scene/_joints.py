@@ -225,41 +225,29 @@ class Joint(eqx.Module):
 _LAWS = ("limits", "friction", "armature", "stiffness", "motor")
 
 
-class Layout(NamedTuple):
+class StateLayout(NamedTuple):
     """Which numbers say how the bodies of a scene stand and move (static).
 
     Bodies form trees. A tree stands on a body that moves freely, on a fixed one, or on the world; all its
     other bodies hang on joints. Coordinates are the poses of the free bodies, and q of the joints; velocities
     are v and ω of the free bodies, six numbers each, then the speeds of the joints.
-
-    Attributes:
-        bodies: Number of bodies.
-        moving: Bodies that are not fixed, in order.
-        free: Those of them that hang on no joint.
-        parents: Of each joint the body that carries it; the number of bodies for the world.
-        children: Of each joint the body that hangs on it.
-        coordinates: Of each joint the first place of its own among q, or −1 for a weld; of one that mimics
-            another the place of that.
-        kinds: Of the joints.
-        follows: Whether each mimics another.
-        dofs: What joints let bodies do: joint, which of its motions, and place among q of each.
-        levels: Joints by their distance from the root of their tree.
-        roots: Of each body the place in `free` of the one that its tree stands on, or −1.
-        moved_by: Whether a motion of `dofs` moves a body, shape (bodies, dofs).
     """
 
-    bodies: int
-    moving: tuple[int, ...]
-    free: tuple[int, ...]
-    parents: tuple[int, ...]
-    children: tuple[int, ...]
+    bodies: int  # Number of bodies
+    moving: tuple[int, ...]  # Bodies that are not fixed, in order
+    free: tuple[int, ...]  # Those of them that hang on no joint
+    parents: tuple[int, ...]  # Of each joint the body that carries it; the number of bodies for the world
+    children: tuple[int, ...]  # Of each joint the body that hangs on it
+    # Of each joint the first place of its own among q, or −1 for a weld; of one that mimics another the place
+    # of that.
     coordinates: tuple[int, ...]
-    kinds: tuple[str, ...]
-    follows: tuple[bool, ...]
+    kinds: tuple[str, ...]  # Of the joints
+    follows: tuple[bool, ...]  # Whether each mimics another
+    # What joints let bodies do: joint, which of its motions, and place among q of each.
     dofs: tuple[tuple[int, int, int], ...]
-    levels: tuple[tuple[int, ...], ...]
-    roots: tuple[int, ...]
-    moved_by: tuple[tuple[bool, ...], ...]
+    levels: tuple[tuple[int, ...], ...]  # Joints by their distance from the root of their tree
+    roots: tuple[int, ...]  # Of each body the place in `free` of the one that its tree stands on, or −1
+    moved_by: tuple[tuple[bool, ...], ...]  # Whether a motion of `dofs` moves a body, shape (bodies, dofs)
 
     @property
     def n_joints(self) -> int:
@@ -343,7 +331,7 @@ def layout_of(
     names: tuple[str, ...],
     fixed: tuple[bool, ...],
     joints: tuple[tuple[str | None, str, str, str | None], ...],
-) -> Layout:
+) -> StateLayout:
     """The layout of bodies and joints.
 
     Args:
@@ -393,7 +381,7 @@ def layout_of(
     kinds = tuple(kind for _, _, kind, _ in joints)
     follows = tuple(bool(mimics) for *_, mimics in joints)
     hanging = (parents, children, coordinates, kinds, follows, dofs)
-    return Layout(len(names), moving, free, *hanging, levels, tuple(roots), moved_by)
+    return StateLayout(len(names), moving, free, *hanging, levels, tuple(roots), moved_by)
 
 
 def _coordinates(joints: Sequence[tuple[str | None, str, str, str | None]]):
@@ -426,32 +414,24 @@ class JointLaws(eqx.Module):
 
     Damping, friction and armature of a joint that mimics another act on the coordinate of that one, by its
     ratio; those of a ball or a planar joint on each of its coordinates alike.
-
-    Attributes:
-        damping: [N m s/rad or N s/m], shape (k,).
-        armature: [kg m² or kg].
-        stiffness: Of springs [N m/rad or N/m].
-        rest: Where they exert no force [rad or m].
-        friction: [N m or N].
-        limits: Least and largest q [rad or m], shape (k, 2).
-        motor: Gear, stiffness and damping of motors, and their least and largest effort, see `Motor`;
-            gear 0 where there is none. Shape (k, 5).
-        constant: Whether a motor gives what it is told to, whatever the joint does (static).
-        rough: Coordinates with limits, friction, or a motor that heeds the joint (static).
     """
 
-    damping: Float[maths.AnyArray, " k"]
-    armature: Float[maths.AnyArray, " k"] | None
-    stiffness: Float[maths.AnyArray, " k"] | None
-    rest: Float[maths.AnyArray, " k"]
-    friction: Float[maths.AnyArray, " k"] | None
-    limits: Float[maths.AnyArray, "k 2"] | None
+    damping: Float[maths.AnyArray, " k"]  # [N m s/rad or N s/m], shape (k,)
+    armature: Float[maths.AnyArray, " k"] | None  # [kg m² or kg]
+    stiffness: Float[maths.AnyArray, " k"] | None  # Of springs [N m/rad or N/m]
+    rest: Float[maths.AnyArray, " k"]  # Where they exert no force [rad or m]
+    friction: Float[maths.AnyArray, " k"] | None  # [N m or N]
+    limits: Float[maths.AnyArray, "k 2"] | None  # Least and largest q [rad or m], shape (k, 2)
+    # Gear, stiffness and damping of motors, and their least and largest effort, see `Motor`; gear 0 where
+    # there is none. Shape (k, 5).
     motor: Float[maths.AnyArray, "k 5"] | None
+    # Whether a motor gives what it is told to, whatever the joint does (static).
     constant: tuple[bool, ...] = eqx.field(static=True)
+    # Coordinates with limits, friction, or a motor that heeds the joint (static).
     rough: tuple[int, ...] = eqx.field(static=True)
 
 
-def joint_laws(layout: Layout, joints: Sequence[Joint], dtype) -> JointLaws:
+def joint_laws(layout: StateLayout, joints: Sequence[Joint], dtype) -> JointLaws:
     """The laws of the joints of a scene."""
     owners, xp = [joints[j] for j in layout.with_coordinates], maths.library(*jax.tree.leaves(joints))
 

@@ -67,23 +67,16 @@ class Loop(eqx.Module):
 
 
 class Loops(eqx.Module):
-    """All loops of a scene as arrays.
+    """All loops of a scene as arrays."""
 
-    Attributes:
-        first: Indices of the first bodies; the number of bodies for the world (static).
-        second: Of the second bodies (static).
-        welds: Rows of those that are welds (static).
-        position: Points of the first bodies, from their centres of mass [m, B, or W].
-        anchor: Of the second bodies.
-        orientation: See `Loop`.
-    """
-
+    # Indices of the first bodies; the number of bodies for the world (static).
     first: tuple[int, ...] = eqx.field(static=True)
-    second: tuple[int, ...] = eqx.field(static=True)
-    welds: tuple[int, ...] = eqx.field(static=True)
+    second: tuple[int, ...] = eqx.field(static=True)  # Of the second bodies (static)
+    welds: tuple[int, ...] = eqx.field(static=True)  # Rows of those that are welds (static)
+    # Points of the first bodies, from their centres of mass [m, B, or W].
     position: Float[maths.AnyArray, "l 3"]
-    anchor: Float[maths.AnyArray, "l 3"]
-    orientation: Float[maths.AnyArray, "l 4"]
+    anchor: Float[maths.AnyArray, "l 3"]  # Of the second bodies
+    orientation: Float[maths.AnyArray, "l 4"]  # See `Loop`
 
     @property
     def size(self) -> int:

@@ -13,7 +13,7 @@ from dano.names import did_you_mean
 from dano.physics.trees.sizes import CLOSES
 from dano.scene._bodies import Body, sizes_of
 from dano.scene._contacts import Contact
-from dano.scene._joints import Joint, Layout, layout_of
+from dano.scene._joints import Joint, layout_of, StateLayout
 
 # Share of the smallest body's size by which gravity may move it in a step before a warning says so, and the
 # share that the warning asks for.
@@ -128,7 +128,7 @@ def warn_of_long_steps(
 
 
 def warn_of_limits(
-    layout: Layout,
+    layout: StateLayout,
     joints: Sequence[Joint],
     q: Float[Array, " k"] | None,
     timestep: Float[Array, ""],
@@ -179,7 +179,7 @@ def room_for(bodies: Sequence[Body], timestep: Float[Array, ""], gravity: Float[
     return CHUNKS_A_BODY * n_moving + sum(flat)
 
 
-def _check_apart(layout: Layout, names: list[str], contact: Contact) -> None:
+def _check_apart(layout: StateLayout, names: list[str], contact: Contact) -> None:
     """Check that joints let the bodies of a contact move against each other.
 
     Raises:

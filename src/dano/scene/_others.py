@@ -84,24 +84,15 @@ class Others(eqx.Module):
     """All pairs of bodies that no contact of a scene names.
 
     Parameters of a pair follow from those of its two bodies, see `pair_params`.
-
-    Attributes:
-        params: Of each body of the scene, arrays of shape (n,).
-        of_edges: Some of them where edges and faces of both bodies are known.
-        law: Of all these pairs.
-        pairs: Indices of the bodies of each pair (static).
-        flat: Whether edges and faces of each body are known (static).
-        shapes: Whether each is a shape and no neural object (static).
-        fixed: Whether each is fixed (static).
     """
 
-    params: ContactParams
-    of_edges: OfEdges
-    law: DistributedLaw
-    pairs: Pairs = eqx.field(static=True)
-    flat: tuple[bool, ...] = eqx.field(static=True)
-    shapes: tuple[bool, ...] = eqx.field(static=True)
-    fixed: tuple[bool, ...] = eqx.field(static=True)
+    params: ContactParams  # Of each body of the scene, arrays of shape (n,)
+    of_edges: OfEdges  # Some of them where edges and faces of both bodies are known
+    law: DistributedLaw  # Of all these pairs
+    pairs: Pairs = eqx.field(static=True)  # Indices of the bodies of each pair (static)
+    flat: tuple[bool, ...] = eqx.field(static=True)  # Whether edges and faces of each body are known (static)
+    shapes: tuple[bool, ...] = eqx.field(static=True)  # Whether each is a shape and no neural object (static)
+    fixed: tuple[bool, ...] = eqx.field(static=True)  # Whether each is fixed (static)
 
     @property
     def pair_params(self) -> ContactParams:

@@ -21,9 +21,9 @@ from dano.objects import checked_inertia
 from dano.scene._bodies import Body
 from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, started, state_arrays
 from dano.scene._contacts import Contact, prepared
-from dano.scene._doubts import Doubt, doubts_of_scene, doubts_of_state, say_doubts
+from dano.scene._doubts import doubts_of_scene, doubts_of_state, say_doubts, SceneDoubt
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
-from dano.scene._joints import Joint, Layout, layout_of, Motor
+from dano.scene._joints import Joint, layout_of, Motor, StateLayout
 from dano.scene._loops import check_loops, Loop, Loops, loops_of
 from dano.scene._making import (
     check_contacts,
@@ -70,32 +70,22 @@ Parts = TypeVar("Parts", tuple[Joint, ...], tuple[Loop, ...])
 
 
 class Scene(eqx.Module):
-    """Everything that stays constant over a rollout. Every array in it is a leaf that can be differentiated.
+    """What stays constant over a rollout. Every array in it is a leaf that can be differentiated."""
 
-    Attributes:
-        bodies: The bodies, in the order that states index.
-        contacts: Which pairs may touch.
-        timestep: h [s].
-        gravity: [m/s², W].
-        twins: For each body the first that is made of the same object: its samples and its solid stand once
-            in memory (static).
-        joints: What hangs on what.
-        others: Pairs of bodies that no contact names; None if they do not touch.
-        room: Chunks of point contacts that a step has room for (static); None leaves it to the engine.
-        loops: What closes chains of joints.
-        sampled: For each body the first with the same samples of its surface, which stand once in memory, as
-            shapes with the same numbers have them (static).
-    """
-
-    bodies: tuple[Body, ...]
-    contacts: tuple[Contact, ...]
-    timestep: Float[Array, ""]
-    gravity: Float[Array, "3"]
+    bodies: tuple[Body, ...]  # The bodies, in the order that states index
+    contacts: tuple[Contact, ...]  # Which pairs may touch
+    timestep: Float[Array, ""]  # h [s]
+    gravity: Float[Array, "3"]  # [m/s², W]
+    # For each body the first that is made of the same object: its samples and its solid stand once in memory
+    # (static).
     twins: tuple[int, ...] = eqx.field(static=True, default=())
-    joints: tuple[Joint, ...] = ()
-    others: Others | None = None
+    joints: tuple[Joint, ...] = ()  # What hangs on what
+    others: Others | None = None  # Pairs of bodies that no contact names; None if they do not touch
+    # Chunks of point contacts that a step has room for (static); None leaves it to the engine.
     room: int | None = eqx.field(static=True, default=None)
-    loops: tuple[Loop, ...] = ()
+    loops: tuple[Loop, ...] = ()  # What closes chains of joints
+    # For each body the first with the same samples of its surface, which stand once in memory, as shapes with
+    # the same numbers have them (static).
     sampled: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
@@ -198,7 +188,7 @@ class Scene(eqx.Module):
         return title, rows, ("", "body", "mass", "size")
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> StateLayout:
         """Which numbers say how the bodies stand and move."""
         return layout_of(*structure(self.bodies, self.joints))
 
@@ -447,7 +437,7 @@ class Scene(eqx.Module):
         say_doubts(self._doubts_of(state, bodies), stacklevel=3)
         return state
 
-    def doubts(self, state: State, given: ByName | None = None) -> list[Doubt]:
+    def doubts(self, state: State, given: ByName | None = None) -> list[SceneDoubt]:
         """What is odd about the scene and a state: units, frames, slips; none where numbers are traced.
 
         Args:
@@ -460,7 +450,7 @@ class Scene(eqx.Module):
             *self._doubts_of(state, given),
         ]
 
-    def _doubts_of(self, state: State, given: ByName | None) -> list[Doubt]:
+    def _doubts_of(self, state: State, given: ByName | None) -> list[SceneDoubt]:
         """Of a state alone; see `doubts`."""
         if maths.is_traced(state, self.timestep):
             return []

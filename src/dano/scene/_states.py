@@ -28,43 +28,29 @@ JOINT_QUANTITIES = ("q", "v")
 
 
 class BodyMotion(NamedTuple):
-    """Pose and velocity of one body, at one time or at all times of a trajectory.
+    """Pose and velocity of one body, at one time or at all times of a trajectory."""
 
-    Attributes:
-        position: Position of the centre of mass [m, W], shape (…, 3).
-        orientation: Unit quaternion wxyz, body → world, shape (…, 4).
-        velocity: Velocity of the centre of mass [m/s, W], shape (…, 3).
-        omega: Angular velocity [rad/s, B], shape (…, 3).
-    """
-
-    position: Float[Array, "*t 3"]
-    orientation: Float[Array, "*t 4"]
-    velocity: Float[Array, "*t 3"]
-    omega: Float[Array, "*t 3"]
+    position: Float[Array, "*t 3"]  # Position of the centre of mass [m, W], shape (…, 3)
+    orientation: Float[Array, "*t 4"]  # Unit quaternion wxyz, body → world, shape (…, 4)
+    velocity: Float[Array, "*t 3"]  # Velocity of the centre of mass [m/s, W], shape (…, 3)
+    omega: Float[Array, "*t 3"]  # Angular velocity [rad/s, B], shape (…, 3)
 
 
 class State(eqx.Module):
     """Configuration and motion of all bodies of a scene, in the order of `Scene.bodies`.
 
     `state["ball"]` is the motion of one body by name.
-
-    Attributes:
-        position: Position of the centre of mass [m, W], shape (n, 3).
-        orientation: Unit quaternion wxyz, body → world, shape (n, 4).
-        velocity: Velocity of the centre of mass [m/s, W], shape (n, 3).
-        omega: Angular velocity [rad/s, B], shape (n, 3).
-        q: Coordinates of the joints [rad or m], shape (k,); None in a scene without joints. They say where
-            bodies on joints are; the rows of these bodies above follow from them (`Scene.filled`).
-        v: Velocities of the joints [rad/s or m/s], shape (k,).
-        names: Names of the bodies (static); None of a state that was made without a scene.
     """
 
-    position: Float[Array, "*t n 3"]
-    orientation: Float[Array, "*t n 4"]
-    velocity: Float[Array, "*t n 3"]
-    omega: Float[Array, "*t n 3"]
+    position: Float[Array, "*t n 3"]  # Position of the centre of mass [m, W], shape (n, 3)
+    orientation: Float[Array, "*t n 4"]  # Unit quaternion wxyz, body → world, shape (n, 4)
+    velocity: Float[Array, "*t n 3"]  # Velocity of the centre of mass [m/s, W], shape (n, 3)
+    omega: Float[Array, "*t n 3"]  # Angular velocity [rad/s, B], shape (n, 3)
+    # Coordinates of the joints [rad or m], shape (k,); None in a scene without joints. They say where bodies
+    # on joints are; the rows of these bodies above follow from them (`Scene.filled`).
     q: Float[Array, "*t k"] | None = None
-    v: Float[Array, "*t k"] | None = None
+    v: Float[Array, "*t k"] | None = None  # Velocities of the joints [rad/s or m/s], shape (k,)
+    # Names of the bodies (static); None of a state that was made without a scene.
     names: tuple[str, ...] | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __getitem__(self, body: str) -> BodyMotion:
@@ -126,35 +112,24 @@ def check_precision(state: State, dtype: np.dtype) -> None:
 
 
 class Control(eqx.Module):
-    """External force and torque on each body, and what drives the joints; constant over a step.
+    """External force and torque on each body, and what drives the joints; constant over a step."""
 
-    Attributes:
-        force: At the centre of mass [N, W], shape (n, 3).
-        torque: [N m, W], shape (n, 3).
-        effort: Torque [N m] or force [N] of each joint between the bodies that it joins, shape (k,); None
-            for none.
-        command: Of the motors, see `Motor`, at the places of their joints, shape (k,); None for zeros.
-    """
-
-    force: Float[Array, "*t n 3"]
-    torque: Float[Array, "*t n 3"]
+    force: Float[Array, "*t n 3"]  # At the centre of mass [N, W], shape (n, 3)
+    torque: Float[Array, "*t n 3"]  # [N m, W], shape (n, 3)
+    # Torque [N m] or force [N] of each joint between the bodies that it joins, shape (k,); None for none.
     effort: Float[Array, "*t k"] | None = None
+    # Of the motors, see `Motor`, at the places of their joints, shape (k,); None for zeros.
     command: Float[Array, "*t k"] | None = None
 
 
 class Origin(NamedTuple):
-    """Where a trajectory comes from: what it is asked about itself needs more than its states.
+    """Where a trajectory comes from: what it is asked about itself needs more than its states."""
 
-    Attributes:
-        scene: That was simulated.
-        engine: That made the steps; None for the default.
-        looks: Gives what bodies look like, by name, for films; None for shapes alone.
-        again: Simulates a scene with other parameters in the same way; None if that is not known.
-    """
-
-    scene: "Scene"
-    engine: Any = None
+    scene: "Scene"  # That was simulated
+    engine: Any = None  # That made the steps; None for the default
+    # Gives what bodies look like, by name, for films; None for shapes alone.
     looks: Callable[[], Any] | None = None
+    # Simulates a scene with other parameters in the same way; None if that is not known.
     again: "Callable[[Scene], Trajectory] | None" = None
 
 
@@ -177,23 +152,15 @@ class Trajectory(eqx.Module):
     `run["ball"]` is the motion of one body over time, `run[-1]` and `run.final` are states. What
     `dano.simulate` returned remembers its scene for `forces`, `touches`, `film` and `show`; what went
     through `jax.jit`, `jax.vmap` or a file has forgotten it: `run.of(scene)` says it again.
-
-    Attributes:
-        times: [s], shape (n_steps + 1,).
-        states: States, leaves of shape (n_steps + 1, n_bodies, ·); the first entry is the initial state.
-        residuals: Largest remaining momentum error of each step divided by mass or inertia [m/s, rad/s],
-            shape (n_steps,).
-        iterations: Newton iterations of each step, shape (n_steps,).
-        converged: Whether each step reached the solver's tolerance, shape (n_steps,).
-        names: Names of the bodies.
     """
 
-    times: Float[Array, " times"]
-    states: State
+    times: Float[Array, " times"]  # [s], shape (n_steps + 1,)
+    states: State  # States, leaves of shape (n_steps + 1, n_bodies, ·); the first entry is the initial state
+    # Largest remaining momentum error of each step divided by mass or inertia [m/s, rad/s], shape (n_steps,).
     residuals: Float[Array, " steps"]
-    iterations: Int[Array, " steps"]
-    converged: Bool[Array, " steps"]
-    names: tuple[str, ...] = eqx.field(static=True)
+    iterations: Int[Array, " steps"]  # Newton iterations of each step, shape (n_steps,)
+    converged: Bool[Array, " steps"]  # Whether each step reached the solver's tolerance, shape (n_steps,)
+    names: tuple[str, ...] = eqx.field(static=True)  # Names of the bodies
     # No leaf of the tree: a batch of runs would hold as many scenes.
     _origin: ClassVar[Origin | None] = None
 

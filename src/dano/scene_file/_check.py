@@ -20,79 +20,46 @@ _PIECE = 20
 
 
 class ContactLine(NamedTuple):
-    """Pairs of bodies with one law and the same parameters.
+    """Pairs of bodies with one law and the same parameters."""
 
-    Attributes:
-        law: Its name in scene files, or its class.
-        pairs: Names of the bodies.
-        parameters: Those that the law reads, by name, in SI units; default ones are filled in.
-    """
-
-    law: str
-    pairs: list[tuple[str, str]]
-    parameters: dict[str, float]
+    law: str  # Its name in scene files, or its class
+    pairs: list[tuple[str, str]]  # Names of the bodies
+    parameters: dict[str, float]  # Those that the law reads, by name, in SI units; default ones are filled in
 
 
 class BodyLine(NamedTuple):
-    """What contact sees of a body.
+    """What contact sees of a body."""
 
-    Attributes:
-        name: Of the body.
-        mass: [kg]; None for a fixed one.
-        samples: Surface samples, or those of mass for the centroid law; 0 for what has none.
-        touching: How many of them meet a floor when the body lies as flat as it can; None if not known.
-        speed: Bound on its speed [m/s], see `dano.scene_file._forecast`.
-        spin: Of the initial state [rad/s].
-    """
-
-    name: str
-    mass: float | None
-    samples: int
+    name: str  # Of the body
+    mass: float | None  # [kg]; None for a fixed one
+    samples: int  # Surface samples, or those of mass for the centroid law; 0 for what has none
+    # How many of them meet a floor when the body lies as flat as it can; None if not known.
     touching: int | None
-    speed: float
-    spin: float
+    speed: float  # Bound on its speed [m/s], see `dano.scene_file._forecast`
+    spin: float  # Of the initial state [rad/s]
 
 
 class Cost(NamedTuple):
-    """What steps cost on this machine, measured.
+    """What steps cost on this machine, measured."""
 
-    Attributes:
-        compile_seconds: Time to compile the simulation [s].
-        steps: How many steps were run to measure.
-        step_seconds: Mean time of one of these [s].
-        slowest_seconds: Time of a step in the slowest twenty of these [s].
-        unsolved: How many of these did not converge.
-        room: Point contacts that a step has room for; None if the scene does not say.
-    """
-
-    compile_seconds: float
-    steps: int
-    step_seconds: float
-    slowest_seconds: float
-    unsolved: int
-    room: int | None
+    compile_seconds: float  # Time to compile the simulation [s]
+    steps: int  # How many steps were run to measure
+    step_seconds: float  # Mean time of one of these [s]
+    slowest_seconds: float  # Time of a step in the slowest twenty of these [s]
+    unsolved: int  # How many of these did not converge
+    room: int | None  # Point contacts that a step has room for; None if the scene does not say
 
 
 class SceneCheck(NamedTuple):
-    """What `check_scene` found.
+    """What `check_scene` found."""
 
-    Attributes:
-        timestep: h [s].
-        n_steps: Steps to simulate.
-        contacts: Laws and parameters.
-        bodies: One line a body.
-        findings: What is not resolved, or odd.
-        runs_on: What makes the steps: see `dano.engine.runs_on`.
-        cost: What steps cost.
-    """
-
-    timestep: float
-    n_steps: int
-    contacts: list[ContactLine]
-    bodies: list[BodyLine]
-    findings: list[Finding]
-    runs_on: str
-    cost: Cost
+    timestep: float  # h [s]
+    n_steps: int  # Steps to simulate
+    contacts: list[ContactLine]  # Laws and parameters
+    bodies: list[BodyLine]  # One line a body
+    findings: list[Finding]  # What is not resolved, or odd
+    runs_on: str  # What makes the steps: see `dano.engine.runs_on`
+    cost: Cost  # What steps cost
 
     @property
     def total_seconds(self) -> tuple[float, float]:

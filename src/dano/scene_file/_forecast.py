@@ -17,7 +17,7 @@ from dano.contact import CentroidLaw, DistributedLaw, Patch, STANDARD_GRAVITY
 from dano.fields import AbstractField, GridField
 from dano.names import see
 from dano.objects import NeuralObject
-from dano.scene import Body, box_volume, Contact, Doubt, RESOLVED, Scene, State
+from dano.scene import Body, box_volume, Contact, RESOLVED, Scene, SceneDoubt, State
 from dano.scene_file._schedule import Schedule
 
 _ROUNDED = 1e-6
@@ -80,7 +80,7 @@ def border_doubts(field: AbstractField, points: np.ndarray) -> list[str]:
 
 def file_doubts(
     scene: Scene, state: State, schedule: Schedule | None, n_steps: int, asked: float | None
-) -> list[Doubt]:
+) -> list[SceneDoubt]:
     """What to say of a run: that controls begin too late, that its length is rounded, that bodies fall.
 
     Args:
@@ -98,18 +98,18 @@ def file_doubts(
             text = (
                 f"[[controls]] {i + 1} never acts: it begins at {start:.4g} s, and {duration:.4g} s are run"
             )
-            found.append(Doubt(2, text))
+            found.append(SceneDoubt(2, text))
     found += [] if schedule is None else _of_forces(scene, schedule)
     if asked is not None and abs(duration - asked) > _ROUNDED * asked:
         text = f"duration {asked:.6g} s is no whole number of steps of {h:.6g} s: {duration:.6g} s are run"
-        found.append(Doubt(3, text))
+        found.append(SceneDoubt(3, text))
     if len(scene.bodies) > 1:
         limits = bounds(scene, scene.filled(state), duration)
-        found += [Doubt(2, finding.text) for finding in support(scene, limits)]
+        found += [SceneDoubt(2, finding.text) for finding in support(scene, limits)]
     return found
 
 
-def _of_forces(scene: Scene, schedule: Schedule) -> list[Doubt]:
+def _of_forces(scene: Scene, schedule: Schedule) -> list[SceneDoubt]:
     """Forces that are thousands of times a body's weight."""
     found = []
     for i, (row, force) in enumerate(zip(schedule.body.tolist(), np.asarray(schedule.force), strict=True)):
@@ -119,7 +119,7 @@ def _of_forces(scene: Scene, schedule: Schedule) -> list[Doubt]:
             text = (
                 f"[[controls]] {i + 1} pushes {body.name!r} with {size:.3g} N, {size / weight:.2g} times its"
             )
-            found.append(Doubt(2, f"{text} weight on earth: is it in newtons?"))
+            found.append(SceneDoubt(2, f"{text} weight on earth: is it in newtons?"))
     return found
 
 
@@ -136,15 +136,10 @@ _INSIDE = 2e-3
 
 
 class Finding(NamedTuple):
-    """Something that a scene's steps do not resolve, or that is odd.
+    """Something that a scene's steps do not resolve, or that is odd."""
 
-    Attributes:
-        subject: start, support, impacts, spin, walls, masses, sizes, samples, timestep, file or solver.
-        text: What it is and what would help, in words.
-    """
-
-    subject: str
-    text: str
+    subject: str  # start, support, impacts, spin, walls, masses, sizes, samples, timestep, file or solver
+    text: str  # What it is and what would help, in words
 
 
 class SpeedBound(NamedTuple):

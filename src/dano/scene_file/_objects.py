@@ -24,6 +24,7 @@ from dano.fields import AbstractField, AbstractShape, companion_files, FIELD_SUF
 from dano.keys import seed_key
 from dano.names import did_you_mean
 from dano.objects import field_size, NeuralObject
+from dano.progress import Progress
 from dano.scene_file._forecast import border_doubts, mass_doubt, size_doubts
 
 if TYPE_CHECKING:
@@ -126,8 +127,6 @@ def _listening() -> Iterator[list[str]]:
         else:
             warnings.warn_explicit(told.message, told.category, told.filename, told.lineno)
 
-
-Progress = Callable[[str, float], None]
 
 ASSETS = {"bunny": 1.0, "soap": 0.15, "trained_bunny": 1.0, "trained_soap": 0.15}
 """Shipped objects and their masses [kg]."""

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.building import BuildOptions
-from dano.checks import checked_items, checked_kind, checked_number, checked_path, shown
+from dano.checks import checked_items, checked_kind, checked_number, checked_path, checked_progress, shown
 from dano.fields import AbstractShape, load_field, scaled, SignedDistanceGrid
 from dano.keys import seed_key
 from dano.maths import rigidly_joined
 from dano.objects import MassProperties, NeuralObject
+from dano.progress import Progress
 from dano.scene_file._forecast import size_doubts
-from dano.scene_file._objects import Progress
 
 _OVERLAPS = 0.1
 """Share of a part's volume inside another from which it is refused: that material would count twice."""
@@ -53,17 +53,11 @@ _WEIGHED = re.compile(r"^(?P<source>.+):(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A part of an object, homogeneous.
+    """A part of an object, homogeneous."""
 
-    Attributes:
-        source: A mesh's file, or a shape.
-        density: Mass per volume [kg/m³].
-        mass: Its mass [kg], instead of the density.
-    """
-
-    source: "str | os.PathLike[str] | AbstractShape"
-    density: int | float | None = None
-    mass: int | float | None = None
+    source: "str | os.PathLike[str] | AbstractShape"  # A mesh's file, or a shape
+    density: int | float | None = None  # Mass per volume [kg/m³]
+    mass: int | float | None = None  # Its mass [kg], instead of the density
 
     def __post_init__(self) -> None:
         """Check it.
@@ -162,7 +156,7 @@ def build_parts(
             f"parts have densities or masses of their own: leave out {dashes}mass and"
             f" {dashes}mass{'-' if dashes else '_'}scale"
         )
-    tell = progress or (lambda description, share: None)
+    tell = checked_progress(progress)
     shapes = _shapes(parts, chosen, tell)
     whole = _joined(shapes)
     if chosen.length is not None:

@@ -26,6 +26,7 @@ from dano.maths import is_traced, Pose
 from dano.memory import memory_limit
 from dano.names import did_you_mean
 from dano.objects import MassModel, NeuralObject
+from dano.progress import Progress
 from dano.robots import close_loops, load_mjcf, load_urdf, Robot
 from dano.scene import (
     Body,
@@ -53,7 +54,6 @@ from dano.scene_file._objects import (
     load_object,
     object_look,
     object_of_file,
-    Progress,
 )
 from dano.scene_file._schedule import read_schedule, Schedule
 from dano.scene_file._table import is_number, located, Table
@@ -178,27 +178,17 @@ def _contact_keys() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a scene file says.
+    """What a scene file says."""
 
-    Attributes:
-        scene: The scene.
-        state: Its initial state.
-        n_steps: Number of steps to simulate.
-        controls: Forces and torques over time, or None.
-        path: Where the file is, or would be: names in it are relative to its folder.
-        text: The file's text.
-        objects: Files of neural objects, or names of shipped ones, by the names of their bodies.
-        default_law: Law of the contacts that name none.
-    """
-
-    scene: Scene
-    state: State
-    n_steps: int
-    controls: Schedule | None
-    path: Path
-    text: str
+    scene: Scene  # The scene
+    state: State  # Its initial state
+    n_steps: int  # Number of steps to simulate
+    controls: Schedule | None  # Forces and torques over time, or None
+    path: Path  # Where the file is, or would be: names in it are relative to its folder
+    text: str  # The file's text
+    # Files of neural objects, or names of shipped ones, by the names of their bodies.
     objects: dict[str, Path | str]
-    default_law: str = DEFAULT_LAW
+    default_law: str = DEFAULT_LAW  # Law of the contacts that name none
 
     def simulate(self, **options: Any) -> Trajectory:
         """`dano.simulate` of what the file says, which films then show with what bodies look like.

@@ -18,8 +18,9 @@ from dano.archive import checked_input
 from dano.engine import simulate
 from dano.maths import Pose
 from dano.objects import NeuralObject
+from dano.progress import Progress
 from dano.scene import Scene, State, Trajectory
-from dano.scene_file._objects import is_shipped, load_object, Progress
+from dano.scene_file._objects import is_shipped, load_object
 from dano.scene_file._reading import parse_scene, SceneFile
 from dano.scene_file._table import located
 

@@ -15,34 +15,21 @@ class Schedule(eqx.Module):
 
     Row i acts on body `body[i]` while `start[i]` ≤ t < `end[i]`, with the force f + k (target − x) − c v and
     the torque τ. Rows that act on one body at one time add up.
-
-    Attributes:
-        body: Index of the body, shape (m,).
-        start: [s], shape (m,).
-        end: [s], shape (m,).
-        force: Constant force f at the centre of mass [N, W], shape (m, 3).
-        torque: τ [N m, W], shape (m, 3).
-        effort: Of the body's joint [N m or N], shape (m,).
-        joint: Place of that joint among the coordinates q, shape (m,).
-        target: Where a spring pulls the centre of mass to [m, W], shape (m, 3).
-        stiffness: k of that spring [N/m], shape (m,).
-        damping: c [N s/m], shape (m,).
-        timestep: h [s]. A step counts as a whole: it belongs to the interval that its middle lies in.
-        now: Time at which the rollout begins [s].
     """
 
-    body: Int[Array, " m"]
-    start: Float[Array, " m"]
-    end: Float[Array, " m"]
-    force: Float[Array, "m 3"]
-    torque: Float[Array, "m 3"]
-    effort: Float[Array, " m"]
-    joint: Int[Array, " m"]
-    target: Float[Array, "m 3"]
-    stiffness: Float[Array, " m"]
-    damping: Float[Array, " m"]
+    body: Int[Array, " m"]  # Index of the body, shape (m,)
+    start: Float[Array, " m"]  # [s], shape (m,)
+    end: Float[Array, " m"]  # [s], shape (m,)
+    force: Float[Array, "m 3"]  # Constant force f at the centre of mass [N, W], shape (m, 3)
+    torque: Float[Array, "m 3"]  # τ [N m, W], shape (m, 3)
+    effort: Float[Array, " m"]  # Of the body's joint [N m or N], shape (m,)
+    joint: Int[Array, " m"]  # Place of that joint among the coordinates q, shape (m,)
+    target: Float[Array, "m 3"]  # Where a spring pulls the centre of mass to [m, W], shape (m, 3)
+    stiffness: Float[Array, " m"]  # k of that spring [N/m], shape (m,)
+    damping: Float[Array, " m"]  # c [N s/m], shape (m,)
+    # h [s]. A step counts as a whole: it belongs to the interval that its middle lies in.
     timestep: Float[Array, ""]
-    now: Float[Array, ""]
+    now: Float[Array, ""]  # Time at which the rollout begins [s]
 
     def __call__(self, state: State, time: Float[Array, ""]) -> Control:
         """Control for the step that begins at `time` [s] after `now`."""

@@ -28,23 +28,14 @@ _FEWEST = 4
 
 @dataclass(frozen=True)
 class TaskFile:
-    """What a task file says.
+    """What a task file says."""
 
-    Attributes:
-        task: The task.
-        controls: First guess [N, N m], shape (T, m).
-        method: How to search, as in `dano.plan`.
-        options: How the search runs.
-        path: The file.
-        text: Its text.
-    """
-
-    task: planning.Task
-    controls: np.ndarray
-    method: planning.Method
-    options: planning.PlanOptions
-    path: Path
-    text: str
+    task: planning.Task  # The task
+    controls: np.ndarray  # First guess [N, N m], shape (T, m)
+    method: planning.Method  # How to search, as in `dano.plan`
+    options: planning.PlanOptions  # How the search runs
+    path: Path  # The file
+    text: str  # Its text
 
 
 def load_task(path: str | os.PathLike[str], scene: Scene) -> TaskFile:

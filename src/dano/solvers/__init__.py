@@ -8,15 +8,16 @@ from dano.solvers._least_squares import (
     eliminated as eliminated,
     gauss_newton as gauss_newton,
     Iterate as Iterate,
+    LeastSquaresOptions as LeastSquaresOptions,
     NormalEquations as NormalEquations,
     Solution as Solution,
     Stop as Stop,
 )
 from dano.solvers._trajectory import (
-    Progress as Progress,
     TrajectoryConstraint as TrajectoryConstraint,
     TrajectoryOptions as TrajectoryOptions,
     TrajectoryProblem as TrajectoryProblem,
+    TrajectoryProgress as TrajectoryProgress,
     TrajectorySolution as TrajectorySolution,
     TrajectoryStop as TrajectoryStop,
     Violation as Violation,

@@ -25,10 +25,10 @@ from dano.solvers._trajectory import (
     held,
     indexed,
     pressed,
-    Progress,
     total_cost,
     TrajectoryOptions,
     TrajectoryProblem,
+    TrajectoryProgress,
     TrajectorySolution,
     TrajectoryStop,
     violated,
@@ -52,7 +52,7 @@ def optimal_trajectory(
     states: Any = None,
     multipliers: Sequence[Array] | None = None,
     options: TrajectoryOptions | None = None,
-    callback: Callable[[Progress], object] | None = None,
+    callback: Callable[[TrajectoryProgress], object] | None = None,
     compiler_options: Mapping[str, bool] | None = None,
 ) -> TrajectorySolution:
     """Solve a problem of optimal control (see the top of `dano.solvers._trajectory`).
@@ -199,9 +199,9 @@ class _Watch:
             found.append(Violation(name, float(table[step, component]), place, int(component)))
         return float(cost), tuple(sorted(found, key=lambda v: -v.amount))
 
-    def _told(self, iterate: IlqrIterate, update: int) -> Progress:
+    def _told(self, iterate: IlqrIterate, update: int) -> TrajectoryProgress:
         cost, worst = self.looked(iterate)
-        return Progress(
+        return TrajectoryProgress(
             update,
             int(iterate.iterations),
             cost,

@@ -34,7 +34,7 @@ _SLOW = 3
 RUNNING, CONVERGED, STUCK = 0, 1, 2
 
 
-class Model(NamedTuple):
+class QuadraticModel(NamedTuple):
     """L to second order and f to first order around a trajectory, by step."""
 
     A: Float[Array, "T n n"]
@@ -62,7 +62,7 @@ class IlqrIterate(NamedTuple):
     states: Any  # x
     controls: Float[Array, "T m"]  # u
     value: Float[Array, ""]  # L
-    model: Model  # Around this trajectory, or the one before until it is renewed
+    model: QuadraticModel  # Around this trajectory, or the one before until it is renewed
     policy: Policy  # Of the last backward pass
     rho: Float[Array, ""]  # Regularisation ρ
     gap_weight: Float[Array, ""]  # Weight of the gaps in the merit L + w Σ|d|
@@ -110,7 +110,7 @@ def first_iterate(problem: TrajectoryProblem, multipliers: Multipliers, states, 
     rows = [jnp.zeros((n_steps, *shape), dtype) for shape in shapes]
     gaps = jnp.zeros((n_steps, n), dtype)
     end = [jnp.zeros(n, dtype), jnp.zeros((n, n), dtype)]
-    model = Model._make([*rows, *end, gaps])
+    model = QuadraticModel._make([*rows, *end, gaps])
     policy = Policy(jnp.zeros((n_steps, m), dtype), jnp.zeros((n_steps, m, n), dtype))
     zero, none = jnp.zeros((), dtype), jnp.asarray(0)
     value = lagrangian(problem, multipliers, states, controls)
@@ -182,16 +182,24 @@ def _iteration(
         shorter,
         (two, i.states, i.controls, nothing, jnp.asarray(0)),
     )
-    taken = worth & enough(found[0], found[3])
-    return _updated(i, model, policy, found, taken, good & small, weight, merit, gap, tolerance)
-
-
-def _updated(
-    i: IlqrIterate, model, policy, found, taken, small, weight, merit, gap, tolerance
-) -> IlqrIterate:
     alpha, states, controls, value, _ = found
-    brought = merit - value - (1 - alpha) * weight * gap
-    little = brought <= tolerance * (1 + jnp.abs(value))
+    taken = worth & enough(alpha, value)
+    little = merit - value - (1 - alpha) * weight * gap <= tolerance * (1 + jnp.abs(value))
+    trial = IlqrIterate(states, controls, value, model, policy, i.rho, weight, *i[7:])
+    return _updated(i, trial, alpha, taken, little, good & small)
+
+
+def _updated(i: IlqrIterate, trial: IlqrIterate, alpha, taken, little, small) -> IlqrIterate:
+    """What follows an iterate: its trial if that is taken.
+
+    Args:
+        i: The iterate.
+        trial: A step further, with the model and the policy of the step.
+        alpha: Length of the step.
+        taken: Whether it is.
+        little: Whether it brings little.
+        small: Whether the model promised little.
+    """
     slow = jnp.where(taken, jnp.where(little, i.slow + 1, 0), i.slow)
     less = jnp.where(i.rho <= _FIRST_RHO, 0.0, i.rho / _RHO_FACTOR)
     # A step that had to be cut short says that the model reaches no further: ρ stays.
@@ -204,22 +212,17 @@ def _updated(
     def chosen(new, old):
         return jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
 
-    return IlqrIterate(
-        chosen(states, i.states),
-        chosen(controls, i.controls),
-        chosen(value, i.value),
-        model,
-        policy,
-        rho,
-        weight,
-        ~taken,
-        slow,
-        i.iterations + 1,
-        status,
+    return trial._replace(
+        **{name: chosen(getattr(trial, name), getattr(i, name)) for name in ("states", "controls", "value")},
+        rho=rho,
+        fresh=~taken,
+        slow=slow,
+        iterations=i.iterations + 1,
+        status=status,
     )
 
 
-def _model(problem: TrajectoryProblem, multipliers: Multipliers, states, controls) -> Model:
+def _model(problem: TrajectoryProblem, multipliers: Multipliers, states, controls) -> QuadraticModel:
     n_steps, m = controls.shape
     inner, following = (jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states))
     steps = jnp.arange(n_steps)
@@ -256,7 +259,7 @@ def _model(problem: TrajectoryProblem, multipliers: Multipliers, states, control
         jnp.zeros(n, controls.dtype),
         problem.convex,
     )
-    return Model(
+    return QuadraticModel(
         A, B, g[:, :n], g[:, n:], G[:, :n, :n], G[:, n:, n:], G[:, n:, :n], end_gradient, end_hessian, gaps
     )
 
@@ -319,7 +322,7 @@ def _second_order(cost, zero, convex: bool):
     return gradient, hessian
 
 
-def _backward(problem: TrajectoryProblem, model: Model, controls, warm, rho) -> tuple[Policy, Array]:
+def _backward(problem: TrajectoryProblem, model: QuadraticModel, controls, warm, rho) -> tuple[Policy, Array]:
     """K and K from the end to the beginning, and whether all Q_uu were positive definite."""
 
     def step(carry, inputs):
@@ -362,7 +365,7 @@ def _bounds(problem: TrajectoryProblem, controls) -> tuple[Array | None, Array |
     return lower, upper
 
 
-def _promise(model: Model, policy: Policy) -> tuple[Array, Array]:
+def _promise(model: QuadraticModel, policy: Policy) -> tuple[Array, Array]:
     """Slope and curvature of L along the step that the model sees, gaps closing with it."""
 
     def step(x, inputs):

@@ -34,17 +34,12 @@ _ZERO = 1e-12
 
 
 class BoxMinimum(NamedTuple):
-    """The minimiser of gᵀk + ½ kᵀHk in a box.
+    """The minimiser of gᵀk + ½ kᵀHk in a box."""
 
-    Attributes:
-        k: The minimiser, shape (m,).
-        inside: Which unknowns are free to move, shape (m,).
-        factor: Cholesky factor of H with rows and columns of the others replaced by those of the identity,
-            shape (m, m).
-    """
-
-    k: Float[Array, " m"]
-    inside: Bool[Array, " m"]
+    k: Float[Array, " m"]  # The minimiser, shape (m,)
+    inside: Bool[Array, " m"]  # Which unknowns are free to move, shape (m,)
+    # Cholesky factor of H with rows and columns of the others replaced by those of the identity, shape (m,
+    # m).
     factor: Float[Array, "m m"]
 
 
@@ -121,25 +116,15 @@ def _solve(factor: Array, right: Array) -> Array:
 
 
 class NormalEquations(NamedTuple):
-    """Gauss–Newton model of the loss at a point.
+    """Gauss–Newton model of the loss at a point."""
 
-    Attributes:
-        loss: f = ½ Σ r².
-        gradient: g = ∂f/∂x, shape (p,).
-        hessian: H ≈ ∂²f/∂x², shape (p, p).
-        block_gradient: b = ∂f/∂z, shape (m, k).
-        block_hessian: B, shape (m, k, k).
-        coupling: C ≈ ∂²f/∂z∂x, shape (m, k, p).
-        block_losses: Parts of the loss that belong to the blocks, shape (m,).
-    """
-
-    loss: float
-    gradient: np.ndarray
-    hessian: np.ndarray
-    block_gradient: np.ndarray
-    block_hessian: np.ndarray
-    coupling: np.ndarray
-    block_losses: np.ndarray
+    loss: float  # f = ½ Σ r²
+    gradient: np.ndarray  # g = ∂f/∂x, shape (p,)
+    hessian: np.ndarray  # H ≈ ∂²f/∂x², shape (p, p)
+    block_gradient: np.ndarray  # b = ∂f/∂z, shape (m, k)
+    block_hessian: np.ndarray  # B, shape (m, k, k)
+    coupling: np.ndarray  # C ≈ ∂²f/∂z∂x, shape (m, k, p)
+    block_losses: np.ndarray  # Parts of the loss that belong to the blocks, shape (m,)
 
 
 class Stop(enum.Enum):
@@ -159,47 +144,27 @@ class Stop(enum.Enum):
 
 
 class Solution(NamedTuple):
-    """Where a minimisation ended, and why.
+    """Where a minimisation ended, and why."""
 
-    Attributes:
-        x: Shared unknowns, shape (p,).
-        blocks: Private unknowns, as `start_blocks` was given.
-        normal: The model there.
-        stop: Why it ended.
-        losses: Loss at the start and after each accepted step.
-        evaluations: How often `linearize` was called.
-    """
-
-    x: np.ndarray
-    blocks: Any
-    normal: NormalEquations
-    stop: Stop
-    losses: np.ndarray
-    evaluations: int
+    x: np.ndarray  # Shared unknowns, shape (p,)
+    blocks: Any  # Private unknowns, as `start_blocks` was given
+    normal: NormalEquations  # The model there
+    stop: Stop  # Why it ended
+    losses: np.ndarray  # Loss at the start and after each accepted step
+    evaluations: int  # How often `linearize` was called
 
 
 class Iterate(NamedTuple):
-    """Where a minimisation is between two steps, and all that the next one depends on.
+    """Where a minimisation is between two steps, and all that the next one depends on."""
 
-    Attributes:
-        x: Shared unknowns.
-        blocks: Private unknowns.
-        losses: Loss at the start and after each accepted step.
-        damping: Of the next step.
-        growth: By what the damping grows if that one fails.
-        slow: Steps in a row that brought next to nothing.
-        spread: Scales of the shared and of the private unknowns.
-        evaluations: How often `linearize` was called.
-    """
-
-    x: np.ndarray
-    blocks: Any
-    losses: tuple[float, ...]
-    damping: float
-    growth: float
-    slow: int
-    spread: tuple[np.ndarray, np.ndarray]
-    evaluations: int
+    x: np.ndarray  # Shared unknowns
+    blocks: Any  # Private unknowns
+    losses: tuple[float, ...]  # Loss at the start and after each accepted step
+    damping: float  # Of the next step
+    growth: float  # By what the damping grows if that one fails
+    slow: int  # Steps in a row that brought next to nothing
+    spread: tuple[np.ndarray, np.ndarray]  # Scales of the shared and of the private unknowns
+    evaluations: int  # How often `linearize` was called
 
 
 # At the start, and its limits: shares of the diagonal of the normal equations, from rounding to "no step".
@@ -224,20 +189,27 @@ _AGAIN = (0.1, 1.0, 10.0)
 _SLOW = 3
 
 
+class LeastSquaresOptions(NamedTuple):
+    """When a minimisation ends."""
+
+    max_iterations: int = 50  # Accepted steps after which to give up
+    tolerance: float = 1e-10  # Stop when the model promises to reduce the loss by less than this share of it
+    perfect: float = 0.0  # Stop when the loss is no larger: what is left is rounding
+
+
+_USUAL = LeastSquaresOptions()
+
+
 def bounded_least_squares(
     linearize: Callable[[np.ndarray, Any], NormalEquations],
-    start: np.ndarray,
+    start: np.ndarray | Iterate,
     *,
     lower: np.ndarray,
     upper: np.ndarray,
     start_blocks: Any = None,
     retract: Callable[[Any, np.ndarray], Any] = lambda blocks, change: blocks,
-    max_iterations: int = 50,
-    tolerance: float = 1e-10,
-    perfect: float = 0.0,
-    progress: Callable[[int, float], None] | None = None,
-    keep: Callable[[Iterate], None] | None = None,
-    since: Iterate | None = None,
+    options: LeastSquaresOptions = _USUAL,
+    callback: Callable[[Iterate], None] | None = None,
 ) -> Solution:
     """Minimise a sum of squares within bounds.
 
@@ -245,33 +217,29 @@ def bounded_least_squares(
         linearize: The normal equations at (x, blocks); a step to where it or its
             derivatives are not finite is rejected.
             After a poor step it is called with the same x again, and other values of some blocks.
-        start: First x, shape (p,).
+        start: First x, shape (p,), or what `callback` was called with: the minimisation goes on there as if
+            it had never stopped.
         lower: Bounds, shape (p,); may be −∞.
         upper: Bounds, shape (p,); may be ∞.
         start_blocks: First private unknowns, of any kind; `linearize` and `retract` understand it.
         retract: Blocks moved by dz, shape (m, k).
-        max_iterations: Accepted steps after which to give up.
-        tolerance: Stop when the model promises to reduce the loss by less than this share of it.
-        perfect: Stop when the loss is no larger: what is left is rounding.
-        progress: Called with the number of accepted steps and the loss. An interrupt (Ctrl-C) ends the
+        options: When it ends.
+        callback: Called before each step with what that depends on. An interrupt (Ctrl-C) ends the
             minimisation with the best point so far.
-        keep: Called before each step with what it depends on.
-        since: What `keep` was called with: the minimisation goes on there as if it had never stopped.
 
     Raises:
         ValueError: If shapes differ, a bound is NaN or crossed, the start lies outside, or the loss or its
             derivatives are not finite there.
     """
-    x, lower, upper = _checked(start, lower, upper)
+    x, lower, upper = _checked(start.x if isinstance(start, Iterate) else start, lower, upper)
+    max_iterations, tolerance, perfect = options
     span = _span(x, lower, upper)
-    now, normal = _begun(linearize, x, start_blocks, since)
+    now, normal = _begun(linearize, start, start_blocks)
     try:
         for iteration in range(len(now.losses) - 1, max_iterations + 1):
-            if keep is not None:
-                keep(now)
+            if callback is not None:
+                callback(now)
             loss = now.losses[-1]
-            if progress is not None:
-                progress(iteration, loss)
             if loss <= max(perfect, np.finfo(float).tiny):
                 return _solution(now, normal, Stop.PERFECT)
             box = lower - now.x, upper - now.x
@@ -298,14 +266,15 @@ def bounded_least_squares(
     return _solution(now, normal, Stop.ITERATIONS)
 
 
-def _begun(linearize, x: np.ndarray, blocks: Any, since: Iterate | None) -> tuple[Iterate, NormalEquations]:
+def _begun(linearize, start: Iterate | np.ndarray, blocks: Any) -> tuple[Iterate, NormalEquations]:
     """Where the first step begins, and the model there.
 
     Raises:
         ValueError: If the loss or its derivatives are not finite there.
     """
-    if since is not None:
-        return since, linearize(since.x, since.blocks)
+    if isinstance(start, Iterate):
+        return start, linearize(start.x, start.blocks)
+    x = np.array(start, dtype=float)
     normal = linearize(x, blocks)
     if not np.isfinite(normal.loss):
         raise ValueError(f"loss must be finite at the start {x.tolist()}, got {normal.loss}")

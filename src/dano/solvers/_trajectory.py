@@ -83,36 +83,26 @@ class TrajectoryProblem(eqx.Module):
 
     Functions that are `eqx.Module`s or `jax.tree_util.Partial`s carry their numbers as arrays: with other
     numbers nothing is compiled again. Plain functions are compiled once each.
-
-    Attributes:
-        dynamics: f(x, u, t) with u of shape (m,) and t an integer.
-        stage_cost: ℓ(x, u, t).
-        final_cost: ℓ_T(x).
-        constraints: g, h, g_T and h_T.
-        lower: Bounds of the controls, shape (m,), or (T, m); None where there are none.
-        upper: As `lower`.
-        retract: x ⊞ δ.
-        difference: difference(x, y) = y ⊟ x, shape (n,).
-        stage_residuals: r(x, u, t) of costs that are ℓ = ½ r·r; their Hessians are then taken as Gauss and
-            Newton do, from first derivatives. None where costs are not of this kind.
-        final_residuals: The same of ℓ_T.
-        convex: Whether the Hessians of the costs are known to have no negative eigenvalue; otherwise negative
-            ones are set to zero (static).
-        parallel: Whether derivatives of all steps are taken at once; otherwise one step after the other,
-            which suits long programs with loops in them (static).
     """
 
-    dynamics: Callable[..., State]
-    stage_cost: Callable[..., Float[Array, ""]]
-    final_cost: Callable[..., Float[Array, ""]]
-    constraints: tuple[TrajectoryConstraint, ...] = ()
+    dynamics: Callable[..., State]  # f(x, u, t) with u of shape (m,) and t an integer
+    stage_cost: Callable[..., Float[Array, ""]]  # ℓ(x, u, t)
+    final_cost: Callable[..., Float[Array, ""]]  # ℓ_T(x)
+    constraints: tuple[TrajectoryConstraint, ...] = ()  # g, h, g_T and h_T
+    # Bounds of the controls, shape (m,), or (T, m); None where there are none.
     lower: Float[Array, "..."] | None = None
-    upper: Float[Array, "..."] | None = None
-    retract: Callable[[Any, Array], Any] = added
-    difference: Callable[[Any, Any], Array] = subtracted
+    upper: Float[Array, "..."] | None = None  # As `lower`
+    retract: Callable[[Any, Array], Any] = added  # x ⊞ δ
+    difference: Callable[[Any, Any], Array] = subtracted  # difference(x, y) = y ⊟ x, shape (n,)
+    # r(x, u, t) of costs that are ℓ = ½ r·r; their Hessians are then taken as Gauss and Newton do, from first
+    # derivatives. None where costs are not of this kind.
     stage_residuals: Callable[..., Float[Array, " r"]] | None = None
-    final_residuals: Callable[..., Float[Array, " r"]] | None = None
+    final_residuals: Callable[..., Float[Array, " r"]] | None = None  # The same of ℓ_T
+    # Whether the Hessians of the costs are known to have no negative eigenvalue; otherwise negative ones are
+    # set to zero (static).
     convex: bool = eqx.field(static=True, default=False)
+    # Whether derivatives of all steps are taken at once; otherwise one step after the other, which suits long
+    # programs with loops in them (static).
     parallel: bool = eqx.field(static=True, default=True)
 
 
@@ -155,75 +145,43 @@ class TrajectoryStop(enum.Enum):
 
 
 class Violation(NamedTuple):
-    """How much a constraint is violated, and where most.
+    """How much a constraint is violated, and where most."""
 
-    Attributes:
-        name: Of the constraint; "dynamics" for gaps between steps.
-        amount: Largest violation, 0 for none.
-        step: Step at which it is largest; T for the end.
-        component: Which of the constraint's numbers it is.
-    """
-
-    name: str
-    amount: float
-    step: int
-    component: int
+    name: str  # Of the constraint; "dynamics" for gaps between steps
+    amount: float  # Largest violation, 0 for none
+    step: int  # Step at which it is largest; T for the end
+    component: int  # Which of the constraint's numbers it is
 
 
-class Progress(NamedTuple):
-    """What a callback is told after every iteration.
+class TrajectoryProgress(NamedTuple):
+    """What a callback is told after every iteration."""
 
-    Attributes:
-        update: Number of multiplier updates so far.
-        iteration: Number of iterations so far, of all inner minima.
-        cost: J.
-        lagrangian: L.
-        violation: Largest violation, with its place.
-        regularization: ρ.
-        states: x, leaves of shape (T + 1, …).
-        controls: u, shape (T, m).
-    """
-
-    update: int
-    iteration: int
-    cost: float
-    lagrangian: float
-    violation: Violation
-    regularization: float
-    states: Any
-    controls: Float[Array, "T m"]
+    update: int  # Number of multiplier updates so far
+    iteration: int  # Number of iterations so far, of all inner minima
+    cost: float  # J
+    lagrangian: float  # L
+    violation: Violation  # Largest violation, with its place
+    regularization: float  # ρ
+    states: Any  # x, leaves of shape (T + 1, …)
+    controls: Float[Array, "T m"]  # u, shape (T, m)
 
 
 class TrajectorySolution(NamedTuple):
-    """Where an optimisation ended, and why.
+    """Where an optimisation ended, and why."""
 
-    Attributes:
-        states: x, leaves of shape (T + 1, …).
-        controls: u, shape (T, m).
-        gains: K, shape (T, m, n): u_t + K_t (x ⊟ x_t) holds the system on the trajectory.
-        multipliers: λ of every constraint, shapes (T, p) or (p,): a warm start of a similar problem.
-        penalty: μ at the end.
-        cost: J.
-        violations: Of every constraint and of the dynamics, the worst first.
-        stop: Why it ended.
-        iterations: Iterations of all inner minima.
-        updates: Multiplier updates.
-        history: J and the largest violation after every inner minimum, shape (updates, 2).
-        seconds: Time it took, with compilation [s].
-    """
-
-    states: Any
-    controls: Float[Array, "T m"]
-    gains: Float[Array, "T m n"]
+    states: Any  # x, leaves of shape (T + 1, …)
+    controls: Float[Array, "T m"]  # u, shape (T, m)
+    gains: Float[Array, "T m n"]  # K, shape (T, m, n): u_t + K_t (x ⊟ x_t) holds the system on the trajectory
+    # λ of every constraint, shapes (T, p) or (p,): a warm start of a similar problem.
     multipliers: tuple[Array, ...]
-    penalty: float
-    cost: float
-    violations: tuple[Violation, ...]
-    stop: TrajectoryStop
-    iterations: int
-    updates: int
-    history: np.ndarray
-    seconds: float
+    penalty: float  # μ at the end
+    cost: float  # J
+    violations: tuple[Violation, ...]  # Of every constraint and of the dynamics, the worst first
+    stop: TrajectoryStop  # Why it ended
+    iterations: int  # Iterations of all inner minima
+    updates: int  # Multiplier updates
+    history: np.ndarray  # J and the largest violation after every inner minimum, shape (updates, 2)
+    seconds: float  # Time it took, with compilation [s]
 
     @property
     def reached(self) -> bool:

@@ -379,7 +379,6 @@ def _plan(w: World) -> Iterator[Call]:
             "task": instance(),
             "method": CHOICE,
             "controls": {"short": np.zeros((2, 3)), "nan": np.full((4, 3), kinds.NAN), "text": "push"},
-            "warm": instance(optional=True),
             "options": instance(optional=True),
             "engine": instance(optional=True),
             "callback": FUNCTION,
@@ -393,9 +392,14 @@ def _plan(w: World) -> Iterator[Call]:
             "plant": instance(),
             "task": instance(),
             "plan": instance(),
-            "substeps": COUNT,
-            "ilqr": instance(optional=True),
+            "replanning": instance(optional=True),
         },
+    )
+    yield Call(
+        "Replanning",
+        dano.Replanning,
+        {"scene": w.scene, "every": 2},
+        {"scene": instance(), "every": COUNT, "ilqr": instance()},
     )
     yield Call(
         "plan.load_controls",

@@ -4,7 +4,7 @@ import textwrap
 import warnings
 
 from dano import scene_file
-from dano.cli._console import Progress, put, put_json
+from dano.cli._console import ProgressLine, put, put_json
 from dano.cli._scenes import load
 from dano.cli.checking._arguments import CheckScene
 
@@ -25,7 +25,7 @@ def check(command: CheckScene) -> None:
         warnings.simplefilter("always")
         loaded = load(command.scene, command.steps, command.timestep)
     doubts = tuple(dict.fromkeys(str(warning.message) for warning in heard))
-    progress = Progress()
+    progress = ProgressLine()
     found = scene_file.check_scene(loaded, seconds=command.seconds, doubts=doubts, progress=progress)
     progress.close()
     if command.json:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from dano.archive import replacing, write_json
-from dano.cli._arguments import Poses
-from dano.cli._console import Progress, put, say
+from dano.cli._arguments import FindPoses
+from dano.cli._console import ProgressLine, put, say
 from dano.cli._learn import look, poses, print_data
 from dano.cli.film._place import Place, read_json
 from dano.cli.film._stages import AGAIN, Stage
@@ -57,7 +57,7 @@ def stages_before(place: Place) -> list[Stage]:
 
 def _check(place: Place) -> None:
     """Seconds that may save an hour."""
-    asked, progress = place.command, Progress()
+    asked, progress = place.command, ProgressLine()
     slide = read_film(asked.slide, slow_motion=asked.slow_motion, progress=progress)
     if asked.background is not None:
         slide.place(asked.background)
@@ -79,12 +79,12 @@ def _check(place: Place) -> None:
 
 def _cameras(place: Place) -> None:
     """One reconstruction of the walk and a frame of the film."""
-    asked, folder, progress = place.command, place.folder, Progress()
+    asked, folder, progress = place.command, place.folder, ProgressLine()
     still = folder / _STILL
     _write_still(asked.slide, still, progress)
     progress.close()
     poses(
-        Poses(
+        FindPoses(
             place.walk,
             (still,),
             folder / "cameras.json",
@@ -108,7 +108,7 @@ def _cameras(place: Place) -> None:
     write_json(folder / "photographs.json", {**found, "frames": [f for f in frames if f not in own]})
 
 
-def _write_still(video: Path, target: Path, progress: Progress) -> None:
+def _write_still(video: Path, target: Path, progress: ProgressLine) -> None:
     """The sharpest frame of a film as a file, in its full size."""
     folder = target.with_suffix("")
     shutil.rmtree(folder, ignore_errors=True)

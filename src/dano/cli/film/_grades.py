@@ -40,7 +40,7 @@ class Grade(NamedTuple):
         return f"{100 * value:.3g}" if self.unit == "%" else f"{value:.3g}"
 
 
-class Verdict(NamedTuple):
+class FrictionVerdict(NamedTuple):
     """A friction with what it may be off by."""
 
     friction: float
@@ -50,7 +50,7 @@ class Verdict(NamedTuple):
     @staticmethod
     def of(
         friction: float, stated: float | None, misfit: float, unexplained: float, share: float
-    ) -> "Verdict":
+    ) -> "FrictionVerdict":
         """The error of a fit, widened.
 
         Poses that the simulation misses by more standard deviations than they may be off say that object,
@@ -65,9 +65,9 @@ class Verdict(NamedTuple):
             share: Standard deviation of the object's size, by training.
         """
         if stated is None:
-            return Verdict(friction, None, None)
+            return FrictionVerdict(friction, None, None)
         of_object = friction * float(np.hypot(share, max(unexplained - _USUAL, 0.0)))
-        return Verdict(friction, stated, float(np.hypot(stated * max(1.0, misfit), of_object)))
+        return FrictionVerdict(friction, stated, float(np.hypot(stated * max(1.0, misfit), of_object)))
 
 
 _USUAL = 0.03
@@ -147,16 +147,16 @@ _GRADES: Mapping[str, Callable[[Place], Grade]] = {
 }
 
 
-def verdict_of(place: Place) -> Verdict:
+def verdict_of(place: Place) -> FrictionVerdict:
     """The friction with its widened error."""
     found = read_json(place.folder / "friction.json")
     (friction,), (stated,) = found["values"].values(), found["standard_errors"].values()
     alike = load_motion(place.folder / "slide.npz").alike
     share = 0.0 if alike is None else float(alike[2])
-    return Verdict.of(friction, stated, float(found["errors"]["rms"]), unexplained(place), share)
+    return FrictionVerdict.of(friction, stated, float(found["errors"]["rms"]), unexplained(place), share)
 
 
-def write_verdict(path: Path, place: Place, grades: list[Grade], verdict: Verdict) -> None:
+def write_verdict(path: Path, place: Place, grades: list[Grade], verdict: FrictionVerdict) -> None:
     """The last page: the friction, the number of each stage, and where to look."""
     from dano.report import write_grades
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from dano import scene_file
 from dano.archive import checked_output, write_text
-from dano.cli._console import numbers, Progress, put, put_json, say
+from dano.cli._console import numbers, ProgressLine, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import chosen, missing_for_pictures
 from dano.cli.identifying._arguments import Identify
@@ -181,7 +181,7 @@ def film_of(command: Identify) -> Callable[..., Seen]:
         scene: Scene,
         motion: Motion,
         chosen: Sequence[Parameter],
-        progress: Progress,
+        progress: ProgressLine,
         settings: dict[str, Any],
     ) -> Seen:
         film = filming.filmed(command.filming, video, command.rate, progress)
@@ -215,7 +215,7 @@ def identify(command: Identify) -> None:
         fit_pixels = film_of(command)
     options = _options(command, kept)
     # An interrupted search returns its best so far.
-    progress = Progress(stops=False)
+    progress = ProgressLine(stops=False)
     loaded = scene_file.load_scene(command.scene, timestep=command.timestep, progress=progress)
     chosen = [parameter_of(text, loaded.scene) for text in command.parameter]
     found, others = (

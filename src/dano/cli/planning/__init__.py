@@ -9,14 +9,14 @@ import numpy as np
 
 from dano import scene_file
 from dano.checks import checked_number
-from dano.cli._arguments import Plan
-from dano.cli._console import Progress, put, put_json, say
+from dano.cli._arguments import PlanTask
+from dano.cli._console import ProgressLine, put, put_json, say
 from dano.cli._interrupt import interrupted
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
 from dano.planning import Plan as Planned, plan as find_plan
 
 
-def plan(command: Plan) -> None:
+def plan(command: PlanTask) -> None:
     """See `dano plan --help`."""
     pictures = {"video": command.video, "strip": command.strip, "controls": command.controls}
     check_output(command.output, command.scene, command.task, suffix=".npz")
@@ -28,7 +28,7 @@ def plan(command: Plan) -> None:
     check_distinct(output=command.output, **pictures)
     checked_number("slow_motion", command.slow_motion, above=0)
     # An interrupted search returns its best so far.
-    progress = Progress(stops=False)
+    progress = ProgressLine(stops=False)
     loaded = scene_file.load_scene(command.scene, progress=progress)
     given = scene_file.load_task(command.task, loaded.scene)
     found = _found(loaded, given, command, progress)
@@ -50,7 +50,7 @@ def plan(command: Plan) -> None:
         say("warning: the plan does not reach all that is required")
 
 
-def _found(loaded, given, command: Plan, progress: Progress) -> Planned:
+def _found(loaded, given, command: PlanTask, progress: ProgressLine) -> Planned:
     options = given.options
     most = options.ilqr.max_iterations * options.ilqr.max_updates
 
@@ -70,7 +70,7 @@ def _found(loaded, given, command: Plan, progress: Progress) -> Planned:
     )
 
 
-def _drawn(loaded, given, found: Planned, command: Plan, progress: Progress) -> dict[str, Path]:
+def _drawn(loaded, given, found: Planned, command: PlanTask, progress: ProgressLine) -> dict[str, Path]:
     """The pictures that were asked for."""
     files: dict[str, Path] = {}
     if command.video is not None or command.strip is not None:
@@ -97,7 +97,7 @@ def _drawn(loaded, given, found: Planned, command: Plan, progress: Progress) -> 
     return files
 
 
-def _numbers(found: Planned, command: Plan) -> dict[str, Any]:
+def _numbers(found: Planned, command: PlanTask) -> dict[str, Any]:
     return {
         "scene": str(command.scene),
         "task": str(command.task),

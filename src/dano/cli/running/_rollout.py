@@ -21,10 +21,10 @@ from jaxtyping import Array
 
 from dano import __version__
 from dano.archive import WorkInProgress
-from dano.cli._console import Progress, put, say
+from dano.cli._console import ProgressLine, put, say
 from dano.engine import contact_history
 from dano.names import see
-from dano.scene import JOINT_QUANTITIES, Layout, Scene, State, state_arrays, STATE_SIZES, Trajectory
+from dano.scene import JOINT_QUANTITIES, Scene, State, state_arrays, STATE_SIZES, StateLayout, Trajectory
 from dano.scene_file import run_piece, SceneFile, too_fast
 
 _FORM = "dano-checkpoint", 1
@@ -180,7 +180,7 @@ class Rollout:
 
 def roll_out(
     loaded: SceneFile,
-    progress: Progress,
+    progress: ProgressLine,
     clock: Clock,
     kept: RunCheckpoint | None = None,
     *,
@@ -288,7 +288,7 @@ def _turning_too_fast(trajectory: Trajectory, scene: Scene) -> list[str]:
     return [name for i, name in enumerate(scene.names) if fast[1:, i].any() and not fast[0, i]]
 
 
-def _joint_numbers(layout: Layout, body: int, last: dict[str, np.ndarray]) -> dict[str, Any]:
+def _joint_numbers(layout: StateLayout, body: int, last: dict[str, np.ndarray]) -> dict[str, Any]:
     """Coordinates q and v of the joint on which a body hangs, if there is one with coordinates."""
     joint = layout.joint_of(body)
     width = 0 if joint is None else layout.width(joint)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from dano.cli._console import Progress, put, put_json, say
+from dano.cli._console import ProgressLine, put, put_json, say
 from dano.cli._outputs import check_distinct, check_output, missing_for_pictures
 from dano.cli.tracking._arguments import Track
 from dano.cli.tracking.filming import camera_of, check_camera, filmed, look_of, options_of
@@ -23,7 +23,7 @@ def track(command: Track) -> dict[str, Any]:
     check_distinct(output=command.output, report=command.report)
     check_camera(command.filming)
     field, options = look_of(command.object, "object"), options_of(command.filming)
-    progress = Progress()
+    progress = ProgressLine()
     film = filmed(command.filming, command.video, command.rate, progress)
     start = None
     if command.start is not None:

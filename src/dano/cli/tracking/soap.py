@@ -16,7 +16,7 @@ import numpy as np
 import dano
 from dano.archive import replacing, write_json
 from dano.cli._arguments import Train
-from dano.cli._console import Progress, put, put_json
+from dano.cli._console import ProgressLine, put, put_json
 from dano.cli._learn import train
 from dano.cli.tracking._arguments import Filming, Track
 from dano.cli.tracking.filming import camera_of, filmed, options_of
@@ -119,7 +119,7 @@ def unpack(folder: Path) -> None:
 
 def _identify(command: Track, case: Path, page: Path, result: Path) -> None:
     """Friction from poses, then from pixels; the numbers, and the page."""
-    progress = Progress()
+    progress = ProgressLine()
     film = filmed(command.filming, command.video, None, progress)
     camera, look = camera_of(command.filming, film), LearnedField.of_object(command.object)
     assert look is not None

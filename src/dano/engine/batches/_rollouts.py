@@ -13,7 +13,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from dano.checks import checked_count, checked_function, checked_path
+from dano.checks import checked_count, checked_path, checked_progress
 from dano.engine._controls import Policy
 from dano.engine._rollout import AbstractEngine, checked_engine
 from dano.engine.batches._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
@@ -21,9 +21,8 @@ from dano.engine.batches._input import checked_job, Job
 from dano.engine.batches._kernel import Kept, simulate_rows
 from dano.engine.batches._store import RolloutStore
 from dano.names import see
+from dano.progress import Progress
 from dano.scene import Control, JOINT_QUANTITIES, Scene, State, STATE_SIZES
-
-Progress = Callable[[str, float], None]
 
 # Rollouts that a device computes at once: more no longer fit a core's cache, fewer leave a GPU idle.
 _BATCH = {"cpu": 32}
@@ -35,27 +34,17 @@ _LATE = 60.0
 
 
 class Rollouts(eqx.Module):
-    """Many rollouts of n bodies: a leading axis of r rollouts, then k kept states.
+    """Many rollouts of n bodies: a leading axis of r rollouts, then k kept states."""
 
-    Attributes:
-        steps: After how many steps each kept state stands, shape (k,); 0 is the initial state.
-        times: [s], shape (r, k).
-        states: States, leaves of shape (r, k, n, ·).
-        converged: Whether every step of a rollout reached the solver's tolerance, shape (r,).
-        first_unconverged: First step of a rollout that did not, shape (r,); −1: none.
-        unconverged: How many steps of a rollout did not, shape (r,).
-        residual: Largest residual of any step, as in `Trajectory.residuals` [m/s, rad/s], shape (r,).
-        names: Names of the bodies.
-    """
-
-    steps: Int[Array, " k"]
-    times: Float[Array, "r k"]
-    states: State
-    converged: Bool[Array, " r"]
-    first_unconverged: Int[Array, " r"]
-    unconverged: Int[Array, " r"]
+    steps: Int[Array, " k"]  # After how many steps each kept state stands, shape (k,); 0 is the initial state
+    times: Float[Array, "r k"]  # [s], shape (r, k)
+    states: State  # States, leaves of shape (r, k, n, ·)
+    converged: Bool[Array, " r"]  # Whether every step of a rollout reached the solver's tolerance, shape (r,)
+    first_unconverged: Int[Array, " r"]  # First step of a rollout that did not, shape (r,); −1: none
+    unconverged: Int[Array, " r"]  # How many steps of a rollout did not, shape (r,)
+    # Largest residual of any step, as in `Trajectory.residuals` [m/s, rad/s], shape (r,).
     residual: Float[Array, " r"]
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # Names of the bodies
 
 
 class StoredRollouts:
@@ -212,11 +201,9 @@ def rollouts(
             checked_count(name, size)
     if path is not None:
         checked_path("path", path)
-    if progress is not None:
-        checked_function("progress", progress)
+    tell = checked_progress(progress)
     job = checked_job(scene, states, n_steps, parameters, controls, checked_engine(engine), keep)
     batch, chunk = _sizes(job, mesh, batch_size, chunk_size)
-    tell = progress or (lambda description, share: None)
     if path is None:
         kept = _into_memory(job, mesh, batch, chunk, tell)
         result = _result(kept, job.steps, job.names)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
-from dano.scene import Layout
+from dano.scene import StateLayout
 
 _SIX = 6
 _WELD = 6
@@ -20,42 +20,26 @@ _WELD = 6
 
 @dataclass(frozen=True, eq=False)
 class TreeStructure:
-    """Tables of whole numbers, rows in the order of the structures that `dano.engine.kernels` reads them as.
+    """Tables of whole numbers, rows in the order of the structures that `dano.engine.kernels` reads."""
 
-    Attributes:
-        n_blocks: Blocks of six unknowns.
-        moving: Body of each node.
-        rows: Node of each body, −1 for a fixed one, shape (n,).
-        nodes: Shape (m, 14).
-        coordinates: Shape (c, 4).
-        unknowns: Shape (6 · blocks, 4).
-        order: Unknowns of trees, from roots to tips.
-        columns: Unknowns that move the bodies that may touch something.
-        blocks: Shape (blocks, 3).
-        closed: Whether loops close each tree, shape (trees,).
-        loops: Shape (loops, 6).
-        motions: How many twists of motions there are.
-        entries: How many entries of a triangle of the matrix of trees.
-    """
-
-    n_blocks: int
-    moving: Int[np.ndarray, " m"]
-    rows: Int[np.ndarray, " n"]
-    nodes: Int[np.ndarray, "m 14"]
-    coordinates: Int[np.ndarray, "c 4"]
-    unknowns: Int[np.ndarray, "u 4"]
-    order: Int[np.ndarray, " o"]
-    columns: Int[np.ndarray, " k"]
-    blocks: Int[np.ndarray, "b 3"]
-    closed: Int[np.ndarray, " t"]
-    loops: Int[np.ndarray, "l 6"]
-    motions: int
-    entries: int
+    n_blocks: int  # Blocks of six unknowns
+    moving: Int[np.ndarray, " m"]  # Body of each node
+    rows: Int[np.ndarray, " n"]  # Node of each body, −1 for a fixed one, shape (n,)
+    nodes: Int[np.ndarray, "m 14"]  # Shape (m, 14)
+    coordinates: Int[np.ndarray, "c 4"]  # Shape (c, 4)
+    unknowns: Int[np.ndarray, "u 4"]  # Shape (6 · blocks, 4)
+    order: Int[np.ndarray, " o"]  # Unknowns of trees, from roots to tips
+    columns: Int[np.ndarray, " k"]  # Unknowns that move the bodies that may touch something
+    blocks: Int[np.ndarray, "b 3"]  # Shape (blocks, 3)
+    closed: Int[np.ndarray, " t"]  # Whether loops close each tree, shape (trees,)
+    loops: Int[np.ndarray, "l 6"]  # Shape (loops, 6)
+    motions: int  # How many twists of motions there are
+    entries: int  # How many entries of a triangle of the matrix of trees
 
 
 @functools.lru_cache(maxsize=256)
 def tree_structure(
-    layout: Layout,
+    layout: StateLayout,
     constant: tuple[bool, ...] = (),
     nonsmooth: tuple[int, ...] = (),
     touching: frozenset[int] = frozenset(),
@@ -112,12 +96,12 @@ class _Nodes:
     """The nodes of a layout, their trees, and which of them stand alone.
 
     Attributes:
-        rows: See `Layout.nodes`.
+        rows: See `StateLayout.nodes`.
         tree: Number of the tree of each node, −1 of one that is alone.
         root: First node of each tree, in the order of nodes.
     """
 
-    def __init__(self, layout: Layout, closing: Iterable[int]):
+    def __init__(self, layout: StateLayout, closing: Iterable[int]):
         self.layout = layout
         self.rows = layout.nodes.reshape(-1, 8)
         self.n_free = 6 * len(layout.free)

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from dano.engine.launching._plans import OfWidth, Plan
+from dano.engine.launching._plans import LaunchPlan, OfWidth
 from dano.native import Array, Layout, Parameters
 
 
 def parameters_of(
-    plan: Plan, layout: Layout, batched: Sequence[bool], n_worlds: int, *, wide: bool = True
+    plan: LaunchPlan, layout: Layout, batched: Sequence[bool], n_worlds: int, *, wide: bool = True
 ) -> Parameters:
     """Parameters of a launch of a plan, whose arrays have shapes, but do not point to memory yet.
 
@@ -49,7 +49,7 @@ class Pointed(NamedTuple):
             self.array.data = address
 
 
-def given_arrays(plan: Plan, parameters: Parameters, *, wide: bool = True) -> list[Pointed]:
+def given_arrays(plan: LaunchPlan, parameters: Parameters, *, wide: bool = True) -> list[Pointed]:
     """What a launch has to point to its memory.
 
     Args:

@@ -9,8 +9,8 @@ import numpy as np
 
 from dano.engine.launching._arguments import given_arrays, parameters_of
 from dano.engine.launching._ffi import Call, Handler, register
-from dano.engine.launching._plans import Plan, Shape
-from dano.native import Kernel, Launch, n_cores, together
+from dano.engine.launching._plans import LaunchPlan, Shape
+from dano.native import Kernel, KernelLaunch, n_cores, together
 
 # Arrays that worlds work in begin where a line of a cache does [bytes].
 _ALIGNED = 64
@@ -19,7 +19,7 @@ _MOST = 256
 
 
 def call(
-    plan: Plan, batched: tuple[bool, ...], n_worlds: int, inputs: Sequence[jax.Array]
+    plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, inputs: Sequence[jax.Array]
 ) -> Sequence[jax.Array]:
     """Outputs of a launch, as part of a program for a CPU."""
     dtype = inputs[0].dtype
@@ -28,7 +28,7 @@ def call(
 
 
 def launched(
-    plan: Plan, batched: tuple[bool, ...], n_worlds: int, inputs: Sequence[jax.Array]
+    plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, inputs: Sequence[jax.Array]
 ) -> list[jax.Array]:
     """Outputs of a launch, outside of any program."""
     dtype = np.dtype(inputs[0].dtype)
@@ -40,28 +40,28 @@ def launched(
 
 
 @functools.lru_cache(maxsize=_MOST)
-def _launcher(plan: Plan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> Handler:
+def _launcher(plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> Handler:
     """What launches so many worlds with numbers of a type."""
-    launcher = _Launcher(plan, batched, n_worlds)
+    launcher = _CpuLauncher(plan, batched, n_worlds)
     return launcher if dtype == np.float64 else _Widened(launcher)
 
 
 @functools.cache
-def _target(plan: Plan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> str:
+def _target(plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, dtype: np.dtype) -> str:
     """Name for `jax.ffi.ffi_call` of such launches."""
     name = plan.named(batched, n_worlds, dtype.name)
     register(name, _launcher(plan, batched, n_worlds, dtype), "cpu")
     return name
 
 
-class _Launcher:
+class _CpuLauncher:
     """Handler of launches.
 
     Each share has parameters of its own, which a call takes, points to its buffers, and puts back: so calls
     from several threads do not meet.
     """
 
-    def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int):
+    def __init__(self, plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int):
         self.plan, self.batched, self.n_worlds = plan, batched, n_worlds
         # Within a call it would be too late to say that it cannot be compiled.
         self._kernel = plan.on_cpu()
@@ -99,7 +99,7 @@ class _Launcher:
 class _Widened:
     """Handler for numbers of 32 bits: kernels on a CPU read and write 64."""
 
-    def __init__(self, launcher: _Launcher):
+    def __init__(self, launcher: _CpuLauncher):
         self.launcher = launcher
 
     def __call__(self, inputs: Sequence[int], outputs: Sequence[int], call: Call | None) -> None:
@@ -125,7 +125,13 @@ class _Share:
     """A launch of some worlds, with parameters of its own."""
 
     def __init__(
-        self, plan: Plan, kernel: Kernel, batched: tuple[bool, ...], n_worlds: int, first: int, count: int
+        self,
+        plan: LaunchPlan,
+        kernel: Kernel,
+        batched: tuple[bool, ...],
+        n_worlds: int,
+        first: int,
+        count: int,
     ):
         parameters = parameters_of(plan, kernel.layout, batched, n_worlds)
         parameters.put("launch.first_world", first)
@@ -144,5 +150,5 @@ class _Share:
             parameters.point(place, tuple(given.shape[:2]), tuple(given.strides[:2]), given.data)
             parameters.array(place).grad = parameters.array(bars).data
         self._kept = memory, plan
-        self.launch = Launch(kernel, parameters, count)
+        self.launch = KernelLaunch(kernel, parameters, count)
         self.arrays = given_arrays(plan, parameters)

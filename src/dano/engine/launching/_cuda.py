@@ -17,7 +17,7 @@ import numpy as np
 
 from dano.engine.launching._arguments import given_arrays, parameters_of
 from dano.engine.launching._ffi import Call, register
-from dano.engine.launching._plans import Build, Plan
+from dano.engine.launching._plans import Build, LaunchPlan
 
 LANES = 32
 """Lanes of a world: those of a warp."""
@@ -35,7 +35,7 @@ _ALIGNED = 16
 
 
 def call(
-    plan: Plan,
+    plan: LaunchPlan,
     batched: tuple[bool, ...],
     n_worlds: int,
     inputs: Sequence[jax.Array],
@@ -66,7 +66,7 @@ def call(
     return found[:-1]
 
 
-def _layout(plan: Plan, build: Build) -> tuple[dict[str, tuple[int, int, int]], int]:
+def _layout(plan: LaunchPlan, build: Build) -> tuple[dict[str, tuple[int, int, int]], int]:
     """Where in a world's room each array begins [bytes], its length and item [bytes]; and the room's size."""
     arrays = plan.layout(build).arrays
     places, at = {}, 0
@@ -82,13 +82,13 @@ def _layout(plan: Plan, build: Build) -> tuple[dict[str, tuple[int, int, int]], 
 
 
 @functools.cache
-def _target(plan: Plan, batched: tuple[bool, ...], n_worlds: int, build: Build, platform: str) -> str:
+def _target(plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, build: Build, platform: str) -> str:
     """Name for `jax.ffi.ffi_call` of launches of so many worlds."""
     name = f"{plan.named(batched, n_worlds, build)}_{platform}"
     for device in _devices(platform):
         # Within a call it would be too late: XLA may be recording.
         plan.compile(build, device)
-    register(name, _Launcher(plan, batched, n_worlds, build, platform), platform)
+    register(name, _CudaLauncher(plan, batched, n_worlds, build, platform), platform)
     return name
 
 
@@ -103,14 +103,16 @@ def _devices(platform: str) -> list[str]:
     return [f"cuda:{device.local_hardware_id}" for device in jax.local_devices(backend="cuda")]
 
 
-class _Launcher:
+class _CudaLauncher:
     """Handler of launches.
 
     Each call takes parameters, points them to its buffers, launches and puts them back: a launch has copied
     them by then.
     """
 
-    def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int, build: Build, platform: str):
+    def __init__(
+        self, plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, build: Build, platform: str
+    ):
         self._made = functools.partial(_Blocks, plan, batched, n_worlds, build)
         self._platform = platform
         self._free: dict[str, list[_Blocks]] = {}
@@ -143,7 +145,7 @@ class _Blocks:
         room_bytes: Size of the room of all worlds, which holds anything when a launch begins.
     """
 
-    def __init__(self, plan: Plan, batched: tuple[bool, ...], n_worlds: int, build: Build, device: str):
+    def __init__(self, plan: LaunchPlan, batched: tuple[bool, ...], n_worlds: int, build: Build, device: str):
         self._parameters = parameters = parameters_of(
             plan, plan.layout(build), batched, n_worlds, wide=build.wide
         )

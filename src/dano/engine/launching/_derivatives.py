@@ -13,7 +13,7 @@ from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from dano.engine.launching._launch import launch_p, merged, Plan, plan, Shape, View
+from dano.engine.launching._launch import launch_p, LaunchPlan, merged, OutputView, plan_of, Shape
 
 _STATE = {"state": "launch.state", "q": "launch.q", "v": "launch.v"}
 _CONTROLS = {"pushes": "launch.pushes", "efforts": "launch.efforts", "commands": "launch.commands"}
@@ -74,7 +74,7 @@ def _is_differentiated(x: Any) -> bool:
     return isinstance(x, Tracer) and type(x).__name__ in ("JVPTracer", "LinearizeTracer")
 
 
-def _jvp(primals, tangents, *, plan: Plan, batched, n_worlds):
+def _jvp(primals, tangents, *, plan: LaunchPlan, batched, n_worlds):
     changes = [
         (i, t) for i, (t, name) in enumerate(zip(tangents, plan.inputs, strict=True))
         if not isinstance(t, ad.Zero) and name in CHANGING
@@ -123,17 +123,17 @@ def _(*inputs, **parameters):
         return jax.jit(lambda *given: tangent_p.bind(*given, **parameters))(*inputs)
 
 
-def _changed(plan: Plan) -> dict[str, Shape]:
+def _changed(plan: LaunchPlan) -> dict[str, Shape]:
     """Outputs of a rollout that have derivatives."""
     return {name: shape for name, shape in plan.outputs.items() if name in CHANGED}
 
 
-def _places(plan: Plan) -> dict[str, Shape]:
+def _places(plan: LaunchPlan) -> dict[str, Shape]:
     """What derivatives read: the inputs of a rollout, and what it found."""
     return {**plan.inputs, **plan.outputs}
 
 
-def _numbers(forward: Plan) -> dict[str, tuple[str, int, Shape]]:
+def _numbers(forward: LaunchPlan) -> dict[str, tuple[str, int, Shape]]:
     """Fields in the order of a launch: which input each is, where it begins, and its shape in a step."""
     n = forward.inputs["launch.state"].rows
     k = forward.inputs["launch.q"].rows if "launch.q" in forward.inputs else 0
@@ -171,7 +171,7 @@ def _joined(parts: dict[str, Any], shapes: dict[str, Shape], lead: tuple[int, ..
     return jnp.concatenate(rows, axis=-1)
 
 
-def _given(forward: Plan, rows: dict[str, Any], lead: tuple[int, ...], dtype: Any) -> Any:
+def _given(forward: LaunchPlan, rows: dict[str, Any], lead: tuple[int, ...], dtype: Any) -> Any:
     """What is given at the start of a rollout, or changes of it, in the order of a launch."""
     numbers = _numbers(forward)
     parts = {
@@ -182,7 +182,9 @@ def _given(forward: Plan, rows: dict[str, Any], lead: tuple[int, ...], dtype: An
     return _joined(parts, {name: shape for name, (_, _, shape) in numbers.items()}, lead, dtype)
 
 
-def _by_steps(forward: Plan, fields: dict[str, str], rows: dict[str, Any], lead: tuple[int, ...], dtype: Any):
+def _by_steps(
+    forward: LaunchPlan, fields: dict[str, str], rows: dict[str, Any], lead: tuple[int, ...], dtype: Any
+):
     """Arrays of all steps by place, (…, steps · rows, width), as numbers: step by step, field by field."""
     numbers, steps = _numbers(forward), forward.numbers["launch.n_steps"]
     parts = {
@@ -193,7 +195,7 @@ def _by_steps(forward: Plan, fields: dict[str, str], rows: dict[str, Any], lead:
     return joined.reshape(*lead, -1)
 
 
-def _of_steps(forward: Plan, fields: dict[str, str], row: Any, lead: tuple[int, ...]) -> dict[str, Any]:
+def _of_steps(forward: LaunchPlan, fields: dict[str, str], row: Any, lead: tuple[int, ...]) -> dict[str, Any]:
     """The other way round: arrays by place from numbers."""
     numbers, steps = _numbers(forward), forward.numbers["launch.n_steps"]
     row = row.reshape(*lead, steps, -1)
@@ -208,43 +210,47 @@ def _of_steps(forward: Plan, fields: dict[str, str], row: Any, lead: tuple[int, 
 _ENDS: dict[str, str] = dict(zip(_STATE, CHANGED, strict=True))
 
 
-def _working(forward: Plan) -> tuple[dict[str, Shape], dict[str, View]]:
+def _working(forward: LaunchPlan) -> tuple[dict[str, Shape], dict[str, OutputView]]:
     """Outputs that kernels of derivatives work in, and views of them."""
     numbers = _numbers(forward)
     row, end = Shape(_length(numbers, numbers), 1), Shape(_length(numbers, _STATE), 1)
     views = {
-        f"room.{part}.{name}": View("ends.values", *numbers[name][1:], "ends.bars")
+        f"room.{part}.{name}": OutputView("ends.values", *numbers[name][1:], "ends.bars")
         for part, names in _READ.items() for name in names if name in numbers
     }  # fmt: skip
-    views |= {f"room.bars.{name}": View("ends.bars", at, shape) for name, (_, at, shape) in numbers.items()}
+    views |= {
+        f"room.bars.{name}": OutputView("ends.bars", at, shape) for name, (_, at, shape) in numbers.items()
+    }
     after = {"state": "room.after_bar", "q": "room.trees.q_after", "v": "room.trees.v_after"}
     views |= {
-        place: View("ends.after", *numbers[name][1:])
+        place: OutputView("ends.after", *numbers[name][1:])
         for name, place in after.items() if numbers[name][2].rows
     }  # fmt: skip
     return {"ends.values": row, "ends.bars": row, "ends.after": end}, views
 
 
-def _pullback_plan(forward: Plan, which: tuple[int, ...]) -> Plan:
+def _pullback_plan(forward: LaunchPlan, which: tuple[int, ...]) -> LaunchPlan:
     wanted = [list(forward.inputs)[i] for i in which]
     numbers, steps = _numbers(forward), forward.numbers["launch.n_steps"]
     outputs, views = _working(forward)
     outputs |= {"ends.controls": Shape(steps * _length(numbers, _CONTROLS), 1)}
     inputs = {"ends.ends": Shape(steps * _length(numbers, _STATE), 1), "ends.given": outputs["ends.values"]}
-    return plan(
-        "dano.engine.kernels.derivatives.pullback",
-        "pullback",
-        forward.features.but(ADJOINTS=True),
-        {**_places(forward), **inputs},
-        {**outputs, **{_MANY[name][0]: forward.inputs[name] for name in wanted if name in _MANY}},
-        forward.whole,
-        {**forward.room, **_pulling_room(forward)},
-        forward.numbers,
-        views,
+    return plan_of(
+        LaunchPlan(
+            "dano.engine.kernels.derivatives.pullback",
+            "pullback",
+            forward.features.but(ADJOINTS=True),
+            {**_places(forward), **inputs},
+            {**outputs, **{_MANY[name][0]: forward.inputs[name] for name in wanted if name in _MANY}},
+            forward.whole,
+            {**forward.room, **_pulling_room(forward)},
+            forward.numbers,
+            views,
+        )
     )
 
 
-def _pulling_room(forward: Plan) -> dict[str, int]:
+def _pulling_room(forward: LaunchPlan) -> dict[str, int]:
     """Lengths of what a world needs besides for derivatives of a step's equations."""
     n = forward.room["room.bodies"]
     room: dict[str, int] = {"room.body_bars": n}
@@ -257,7 +263,7 @@ def _pulling_room(forward: Plan) -> dict[str, int]:
     return room
 
 
-def _rows(plan: Plan, inputs: Any, batched: Any) -> dict[str, Any]:
+def _rows(plan: LaunchPlan, inputs: Any, batched: Any) -> dict[str, Any]:
     """Inputs of a rollout by place, with an axis of worlds, of which there is one where all are alike."""
     rows = zip(plan.inputs, inputs, batched, strict=False)
     return {place: x if differs else x[None] for place, x, differs in rows}
@@ -355,7 +361,7 @@ def _spread(change, axis, size: int):
     return jnp.broadcast_to(change[:, None], (change.shape[0], size, *change.shape[1:]))
 
 
-def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) -> Plan:
+def _pushforward_plan(forward: LaunchPlan, which: tuple[int, ...], n_directions: int) -> LaunchPlan:
     wanted = [list(forward.inputs)[i] for i in which]
     many = {name: forward.inputs[name] for name in wanted if name in _MANY}
     numbers, steps = _numbers(forward), n_directions * forward.numbers["launch.n_steps"]
@@ -367,16 +373,18 @@ def _pushforward_plan(forward: Plan, which: tuple[int, ...], n_directions: int) 
     room = {_MANY[name][0]: x.rows for name, x in many.items() if name != _COEFFICIENTS}
     room |= {"room.lane_sums": n_directions, "room.along": n_directions, "room.moving": n_directions * row}
     room["room.missing"] = n_directions * forward.room["room.velocity"]
-    return plan(
-        "dano.engine.kernels.derivatives.pushforward",
-        "pushforward",
-        forward.features.but(ADJOINTS=True),
-        {**_places(forward), **inputs},
-        {"ends.ends": Shape(steps * _length(numbers, _STATE), 1), **outputs},
-        forward.whole,
-        {**forward.room, **_pulling_room(forward), **room},
-        {**forward.numbers, "launch.n_directions": n_directions},
-        views,
+    return plan_of(
+        LaunchPlan(
+            "dano.engine.kernels.derivatives.pushforward",
+            "pushforward",
+            forward.features.but(ADJOINTS=True),
+            {**_places(forward), **inputs},
+            {"ends.ends": Shape(steps * _length(numbers, _STATE), 1), **outputs},
+            forward.whole,
+            {**forward.room, **_pulling_room(forward), **room},
+            {**forward.numbers, "launch.n_directions": n_directions},
+            views,
+        )
     )
 
 

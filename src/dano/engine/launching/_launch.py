@@ -18,18 +18,18 @@ from jax.interpreters import batching, mlir
 from dano.engine._compiling import are_on_cpus, by_numpy_on_cpus
 from dano.engine.launching import _cpu, _cuda
 from dano.engine.launching._plans import (
+    LaunchPlan as LaunchPlan,
     OfWidth as OfWidth,
-    Plan as Plan,
-    plan as plan,
+    OutputView as OutputView,
+    plan_of as plan_of,
     Shape as Shape,
-    View as View,
 )
 
 launch_p = Primitive("dano_launch")
 launch_p.multiple_results = True
 
 
-def launch(plan: Plan, inputs: dict[str, Any]) -> dict[str, Any]:
+def launch(plan: LaunchPlan, inputs: dict[str, Any]) -> dict[str, Any]:
     """Launch a kernel for one world; `jax.vmap` makes it a launch of many.
 
     Args:

@@ -33,7 +33,7 @@ from dano.fields import (
     Sphere,
     UnionField,
 )
-from dano.native import balls_around_runs, leaves_of, Placed
+from dano.native import balls_around_runs, leaves_of, PlacedField
 from dano.scene import colliders, Scene, State
 
 # Shapes with an outward direction of their own; that of others is the gradient of their distance.
@@ -51,20 +51,20 @@ class PatchPair(NamedTuple):
     law: AbstractPatchLaw  # The law
 
 
-class PatchTables(NamedTuple):
+class PatchRows(NamedTuple):
     """Contacts with a patch law for kernels."""
 
     rows: dict[str, Array]  # Real numbers by place in a kernel's parameters
     whole: dict[str, np.ndarray]  # Whole numbers by place
-    leaves: list[Placed]  # Leaves for `scene.solids`, behind those that stand there already
+    leaves: list[PlacedField]  # Leaves for `scene.solids`, behind those that stand there already
     pair_index: np.ndarray  # Rows for `scene.pair_index`, behind those of pairs with samples that press
     unions: bool  # Whether a field has several parts, or a part several leaves
 
 
-class _Part(NamedTuple):
+class _FieldPart(NamedTuple):
     """A part of a field: its leaves, edge width, whether its direction is the distance's gradient, map."""
 
-    leaves: list[Placed]
+    leaves: list[PlacedField]
     edge: Array
     by_gradient: bool
     support: Support | None
@@ -100,7 +100,7 @@ def patch_tables(
     n_pairs: int = 0,
     n_leaves: int = 0,
     twins: Sequence[int] = (),
-) -> PatchTables:
+) -> PatchRows:
     """Tables of contacts.
 
     Args:
@@ -114,7 +114,7 @@ def patch_tables(
         ValueError: If kernels do not know a law or a field, or a pair has nothing to sum over.
     """
     if not pairs:
-        return PatchTables({}, {}, [], _integers([], 5), False)
+        return PatchRows({}, {}, [], _integers([], 5), False)
     samples, fields = _Samples(dtype, twins), _Fields(dtype, n_leaves, twins)
     contacts, materials, sides, side_index, index = [], [], [], [], []
     for k, pair in enumerate(pairs):
@@ -136,7 +136,7 @@ def patch_tables(
         "scene.patches.side_index": _integers(side_index, 7),
         "scene.patches.fields.kinds": _integers(fields.kinds, 6),
     }
-    return PatchTables(
+    return PatchRows(
         rows,
         whole,
         fields.leaves,
@@ -168,7 +168,7 @@ def _sides(pair: PatchPair, samples: "_Samples", fields: "_Fields"):
     found = []
     for (i, sampled), (j, queried) in (bodies, bodies[::-1]):
         if isinstance(sampled.field, Sphere) and isinstance(queried.field, HalfSpace):
-            ball = fields.leaf(Placed.still(sampled.field, fields.dtype))
+            ball = fields.leaf(PlacedField.still(sampled.field, fields.dtype))
             row = jnp.zeros(5, fields.dtype)
             return [(row, (i, j, 0, 0, *fields.place(j, queried.field, None), ball))]
         if sampled.samples is not None and queried.field is not None:
@@ -236,7 +236,7 @@ class _Fields:
         self._distances: list[Array] = []
         self._n_distances = 0
         self.kinds: list[tuple[int, ...]] = []
-        self.leaves: list[Placed] = []
+        self.leaves: list[PlacedField] = []
         self.unions = False
 
     def place(self, body: int, field: AbstractField, support: Support | None) -> tuple[int, int]:
@@ -247,7 +247,7 @@ class _Fields:
         twin = self._twins[body] if self._twins else body
         key = (twin, 0 if isinstance(field, GridField) else id(field))
         if key not in self._places:
-            parts = _parts_of(Placed.still(field, self.dtype), support)
+            parts = _parts_of(PlacedField.still(field, self.dtype), support)
             self._places[key] = len(self.kinds), len(parts)
             # As long as it is kept, no other object has its identity.
             self._kept.append(field)
@@ -256,7 +256,7 @@ class _Fields:
                 self._add(part)
         return self._places[key]
 
-    def _add(self, part: _Part) -> None:
+    def _add(self, part: _FieldPart) -> None:
         first = [self.leaf(leaf) for leaf in part.leaves][0]
         self.unions = self.unions or len(part.leaves) > 1
         map_row, nodes = jnp.zeros(9, self.dtype), (0, 0, 0)
@@ -274,7 +274,7 @@ class _Fields:
         self._n_distances += int(np.prod(nodes))
         self._parts.append(jnp.concatenate([part.edge.astype(self.dtype)[None], map_row]))
 
-    def leaf(self, placed: Placed) -> int:
+    def leaf(self, placed: PlacedField) -> int:
         """Index of a new leaf."""
         self.leaves.append(placed)
         return self._first_leaf + len(self.leaves) - 1
@@ -290,7 +290,7 @@ class _Fields:
         }
 
 
-def _parts_of(placed: Placed, support: Support | None) -> list[_Part]:
+def _parts_of(placed: PlacedField, support: Support | None) -> list[_FieldPart]:
     """The parts of a field, the densest of which counts."""
     field = placed.field
     if isinstance(field, PosedField):
@@ -300,13 +300,13 @@ def _parts_of(placed: Placed, support: Support | None) -> list[_Part]:
     if isinstance(field, UnionField):
         return [part for each in field.fields for part in _parts_of(placed.inside(each), None)]
     if isinstance(field, GridField):
-        return [_Part([placed], jnp.zeros_like(placed.factor), True, support or Support.create(field))]
+        return [_FieldPart([placed], jnp.zeros_like(placed.factor), True, support or Support.create(field))]
     if isinstance(field, AbstractShape):
         inner: AbstractShape = field
         while isinstance(inner, PosedShape | ScaledShape):
             inner = inner.shape
         edge = placed.factor * field.edge_width.astype(placed.factor.dtype)
-        return [_Part(leaves_of(placed), edge, not isinstance(inner, _OWN_DIRECTION), None)]
+        return [_FieldPart(leaves_of(placed), edge, not isinstance(inner, _OWN_DIRECTION), None)]
     raise ValueError(
         "field must be a grid of densities or made of shapes, posed, scaled or joined, got "
         f"{type(field).__name__}: dano.bake(field).grid is a grid of it"

@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import threading
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ class OfWidth(NamedTuple):
     narrow: float
 
 
-class View(NamedTuple):
+class OutputView(NamedTuple):
     """A part of the rows of an output as an array of its own."""
 
     output: str  # Place of the output, of rows of one number
@@ -40,7 +41,7 @@ class View(NamedTuple):
     gradient: str = ""  # Place of an output with the derivatives by it, at the same numbers; empty for none
 
 
-class Whole:
+class WholeNumbers:
     """Whole numbers of a scene by place in a kernel's parameters, on the host.
 
     Attributes:
@@ -66,39 +67,21 @@ class Whole:
         return int((self.arrays["scene.pair_index"][:, 3] >= 0).sum())
 
 
-class Plan:
-    """A launch but for its real numbers.
+@dataclass(eq=False)
+class LaunchPlan:
+    """A launch but for its real numbers."""
 
-    Attributes:
-        module: Module of `dano.engine.kernels` that has the kernel.
-        kernel: Its name.
-        features: What it must know.
-        inputs: Place of each input in the kernel's parameters, such as "scene.bodies", and its shape.
-        outputs: The same of the outputs.
-        whole: Whole numbers, the same for all worlds.
-        room: Lengths of the arrays that a world of one lane works in, by place.
-        numbers: Other fields of the parameters, by place, some of them `OfWidth`.
-        views: Arrays that are parts of outputs, by place.
-    """
-
-    def __init__(
-        self,
-        module: str,
-        kernel: str,
-        features: Features,
-        inputs: dict[str, Shape],
-        outputs: dict[str, Shape],
-        whole: Whole,
-        room: dict[str, int],
-        numbers: dict[str, Any],
-        views: dict[str, View],
-    ):
-        """See the class."""
-        self.module, self.kernel, self.features = module, kernel, features
-        self.inputs, self.outputs, self.room, self.numbers = inputs, outputs, room, numbers
-        self.whole, self.views = whole, views
-        self._compiled: set[tuple[Build, str]] = set()
-        self._layouts: dict[Build, Layout] = {}
+    module: str  # Module of `dano.engine.kernels` that has the kernel
+    kernel: str  # Its name
+    features: Features  # What it must know
+    inputs: dict[str, Shape]  # Place of each input in the kernel's parameters, such as "scene.bodies"
+    outputs: dict[str, Shape]  # The same of the outputs
+    whole: WholeNumbers  # Whole numbers, the same for all worlds
+    room: dict[str, int]  # Lengths of the arrays that a world of one lane works in, by place
+    numbers: dict[str, Any]  # Other fields of the parameters, by place, some of them `OfWidth`
+    views: dict[str, OutputView] = field(default_factory=dict)  # Arrays that are parts of outputs, by place
+    _compiled: set[tuple[Build, str]] = field(default_factory=set, init=False)
+    _layouts: dict[Build, Layout] = field(default_factory=dict, init=False)
 
     def named(self, *more: Any) -> str:
         """A name of launches for XLA, the same in each process, so that it finds what it compiled before.
@@ -157,34 +140,13 @@ _OF_ROOM = {
     "room.given_patches.sums": ("room.patches.sums", "room.patches.sum_bars"),
 }
 
-_plans: dict[Any, Plan] = {}
+_plans: dict[Any, LaunchPlan] = {}
 _lock = threading.Lock()
 
 
-def plan(
-    module: str,
-    kernel: str,
-    features: Features,
-    inputs: dict[str, Shape],
-    outputs: dict[str, Shape],
-    whole: Whole,
-    room: dict[str, int],
-    numbers: dict[str, Any],
-    views: dict[str, View] | None = None,
-) -> Plan:
-    """A plan; equal ones are the same object, so that compiled programs are found again."""
-    key = (
-        module,
-        kernel,
-        features,
-        tuple(inputs.items()),
-        tuple(outputs.items()),
-        whole.digest,
-        tuple(room.items()),
-        tuple(numbers.items()),
-        tuple((views or {}).items()),
-    )
+def plan_of(new: LaunchPlan) -> LaunchPlan:
+    """The first plan that is equal to a new one, so that compiled programs are found again."""
+    tables = (new.inputs, new.outputs, new.room, new.numbers, new.views)
+    key = (new.module, new.kernel, new.features, new.whole.digest, *(tuple(t.items()) for t in tables))
     with _lock:
-        if key not in _plans:
-            _plans[key] = Plan(module, kernel, features, inputs, outputs, whole, room, numbers, views or {})
-        return _plans[key]
+        return _plans.setdefault(key, new)

@@ -14,7 +14,7 @@ from dano.engine._reports import Report, SolverOptions
 from dano.engine.joints import tree_lengths
 from dano.engine.launching import _derivatives  # noqa: F401  rules for derivatives of launches
 from dano.engine.launching._cuda import LANES, MORE_POINTS
-from dano.engine.launching._launch import launch, OfWidth, Plan, plan, Shape
+from dano.engine.launching._launch import launch, LaunchPlan, OfWidth, plan_of, Shape
 from dano.engine.launching._tables import Tables
 from dano.maths import AnyArray, library
 from dano.scene import Control, JOINT_QUANTITIES, State, STATE_SIZES
@@ -119,7 +119,9 @@ def listed_points(tables: Tables, state: State, capacity: int) -> dict[str, Arra
     outputs = {"listing.points": Shape(points, sum(_POINT.values())), "listing.overflow": Shape(1, 1)}
     room, numbers = room_of(tables, shapes, n, points), tables.numbers
     module = "dano.engine.kernels.listing"
-    chosen = plan(module, "listing", tables.features, shapes, outputs, tables.whole, room, numbers)
+    chosen = plan_of(
+        LaunchPlan(module, "listing", tables.features, shapes, outputs, tables.whole, room, numbers)
+    )
     found = launch(chosen, inputs)
     ends = np.cumsum(list(_POINT.values()))[:-1]
     parts = jnp.split(found["listing.points"], ends, axis=1)
@@ -138,7 +140,7 @@ def _plan(
     capacity: int,
     options: SolverOptions,
     dtype,
-) -> Plan:
+) -> LaunchPlan:
     relative = float(jnp.finfo(dtype).eps) ** 0.75 if options.tolerance is None else options.tolerance
     # Kernels on a CPU compute with 64 bits whatever goes in and comes out.
     rounding = OfWidth(*(float(np.finfo(x).eps) for x in (np.float64, np.float32)))
@@ -158,7 +160,9 @@ def _plan(
     if len(tables.structure.loops):
         outputs["launch.forces"] = Shape(n_steps * len(tables.structure.loops), WRENCH)
     room = room_of(tables, shapes, n, CHUNK * capacity)
-    return plan(_MODULE, "rollout", tables.features, shapes, outputs, tables.whole, room, numbers)
+    return plan_of(
+        LaunchPlan(_MODULE, "rollout", tables.features, shapes, outputs, tables.whole, room, numbers)
+    )
 
 
 def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> dict[str, int]:

@@ -8,11 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import DTypeLike, Float, Int
 
-from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Material, materials, SurfaceSet
+from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Materials, materials, SurfaceSet
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
 from dano.engine.launching._builds import build_for
-from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchTables
-from dano.engine.launching._plans import Whole
+from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchRows
+from dano.engine.launching._plans import WholeNumbers
 from dano.maths import AnyArray, is_traced, library
 from dano.native import (
     balls_around_runs,
@@ -22,7 +22,7 @@ from dano.native import (
     kinds_of,
     leaf_tables,
     leaves_of,
-    Placed,
+    PlacedField,
     slabs_of_blocks,
 )
 from dano.scene import Body, pressing_pairs, Scene
@@ -48,19 +48,13 @@ SWEPT = 48
 
 
 class Tables(eqx.Module):
-    """A scene for kernels.
+    """A scene for kernels."""
 
-    Attributes:
-        rows: Real numbers by place in a kernel's parameters, arrays of rows.
-        whole: Whole numbers (static).
-        features: What kernels must know of the scene (static).
-        structure: Kinematic trees and loops (static).
-    """
-
+    # Real numbers by place in a kernel's parameters, arrays of rows.
     rows: dict[str, Float[AnyArray, "rows width"]]
-    whole: Whole = eqx.field(static=True)
-    features: Features = eqx.field(static=True)
-    structure: TreeStructure = eqx.field(static=True)
+    whole: WholeNumbers = eqx.field(static=True)  # Whole numbers (static)
+    features: Features = eqx.field(static=True)  # What kernels must know of the scene (static)
+    structure: TreeStructure = eqx.field(static=True)  # Kinematic trees and loops (static)
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -177,7 +171,7 @@ def scene_tables(scene: Scene) -> Tables:
     if scene.joints:
         of_trees, whole_of_trees = tree_rows(scene, structure)
         arrays, whole = {**arrays, **of_trees}, {**whole, **whole_of_trees}
-    return Tables(arrays, Whole(whole), features, structure)
+    return Tables(arrays, WholeNumbers(whole), features, structure)
 
 
 # Radius of a half-space, which has none.
@@ -228,7 +222,7 @@ def _materials(
     dtype: DTypeLike,
 ) -> Float[AnyArray, "contacts width"]:
     if not groups:
-        return np.zeros((0, len(Material._fields)), dtype)
+        return np.zeros((0, len(Materials._fields)), dtype)
     fields = materials(groups, scene.timestep, _strength(scene))._asdict()
     if "numbers" in fields_of(features, _STRUCTURES, "Material"):
         xp = library(*(law.numbers for law, _ in groups))
@@ -267,11 +261,13 @@ def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
     return rows, index
 
 
-def _solids(scene: Scene, used: set[int], dtype: DTypeLike) -> tuple[list[Placed], list[tuple[int, int]]]:
+def _solids(
+    scene: Scene, used: set[int], dtype: DTypeLike
+) -> tuple[list[PlacedField], list[tuple[int, int]]]:
     """Leaves of each different solid in use, and for each body where its own begin and how many they are."""
     twins = scene.twins or tuple(range(len(scene.bodies)))
     first: dict[int, tuple[int, int]] = {}
-    leaves: list[Placed] = []
+    leaves: list[PlacedField] = []
     index = []
     for i, body in enumerate(scene.bodies):
         solid = body.solid if i in used else None
@@ -279,14 +275,14 @@ def _solids(scene: Scene, used: set[int], dtype: DTypeLike) -> tuple[list[Placed
             index.append((0, 0))
             continue
         if twins[i] not in first:
-            parts = leaves_of(Placed.still(solid, dtype))
+            parts = leaves_of(PlacedField.still(solid, dtype))
             first[twins[i]] = len(leaves), len(parts)
             leaves += parts
         index.append(first[twins[i]])
     return leaves, index
 
 
-def _patches(scene: Scene, n_pairs: int, n_leaves: int) -> PatchTables:
+def _patches(scene: Scene, n_pairs: int, n_leaves: int) -> PatchRows:
     """Contacts with a patch law, behind pairs and leaves of the others."""
     twins = scene.twins or tuple(range(len(scene.bodies)))
     pairs = patch_pairs(scene)

@@ -3,7 +3,7 @@
 from jaxtyping import Array, Float
 
 from dano.contact import CHUNK
-from dano.engine.launching._launch import launch, plan, Shape
+from dano.engine.launching._launch import launch, LaunchPlan, plan_of, Shape
 from dano.engine.launching._stepping import given, REPORT, room_of, WRENCH
 from dano.engine.launching._tables import Tables
 from dano.scene import State
@@ -63,5 +63,5 @@ def _seen(
         room["room.wrenches"] = room["room.found"]
     outputs = {name: Shape(pairs, width), **found}
     whole, numbers = tables.whole, tables.numbers
-    chosen = plan(_MODULE, kernel, tables.features, shapes, outputs, whole, room, numbers)
+    chosen = plan_of(LaunchPlan(_MODULE, kernel, tables.features, shapes, outputs, whole, room, numbers))
     return launch(chosen, inputs)[name]

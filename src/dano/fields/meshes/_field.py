@@ -4,6 +4,7 @@ Winding numbers of closed meshes, and how nodes are marked by a mesh.
 """
 
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple, TYPE_CHECKING
 
@@ -187,14 +188,7 @@ def mesh_field(
     margin = 3
     shape = np.ceil((upper - lower) / spacing).astype(int) + 1 + 2 * margin
     origin = 0.5 * (lower + upper) - 0.5 * spacing * (shape - 1)
-    distances, overlap = None, False
-    for part in solid.parts:
-        found, crosses = _mesh_distances(part, origin, spacing, shape, closed)
-        overlap = overlap or crosses
-        if distances is not None:
-            overlap = overlap or bool(np.any((found < 0) & (distances < 0)))
-            found = np.minimum(found, distances)
-        distances = found
+    distances, overlap = _union(_mesh_distances(part, origin, spacing, shape, closed) for part in solid.parts)
     if distances is None or not distances.min() < 0:
         raise ValueError(
             f"{name}: resolution must be so large that some nodes lie inside, got {chosen}, all outside:"
@@ -206,6 +200,18 @@ def mesh_field(
         warnings.warn(f"{name}: {thin}", stacklevel=2)
     moments = None if overlap else mesh_moments(solid.whole)
     return SignedDistanceGrid(distances, origin, spacing, interpolation, edge=edge, moments=moments)
+
+
+def _union(parts: Iterable[tuple[np.ndarray, bool]]) -> tuple[np.ndarray | None, bool]:
+    """Distances to the union of parts, and whether they, or one of them with itself, overlap."""
+    distances, overlap = None, False
+    for found, crosses in parts:
+        overlap = overlap or crosses
+        if distances is not None:
+            overlap = overlap or bool(np.any((found < 0) & (distances < 0)))
+            found = np.minimum(found, distances)
+        distances = found
+    return distances, overlap
 
 
 def mesh_moments(solid: "trimesh.Trimesh") -> SolidMoments:

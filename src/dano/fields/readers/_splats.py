@@ -25,21 +25,14 @@ Y0 = 0.5 / math.sqrt(math.pi)
 
 @dataclasses.dataclass(frozen=True)
 class Splats:
-    """Gaussians that a scene is drawn with, as NumPy arrays in one frame.
+    """Gaussians that a scene is drawn with, as NumPy arrays in one frame."""
 
-    Attributes:
-        means: Centres [m], shape (n, 3).
-        scales: Logarithms of the standard deviations [m] along the axes of each, shape (n, 3).
-        quats: Orientations wxyz, not necessarily of unit length, shape (n, 4).
-        opacities: Logits of the opacities, shape (n,).
-        colours: Coefficients of spherical harmonics of degrees 0 to 3, shape (n, k, 3) with k = 1, 4, 9 or
-            16.
-    """
-
-    means: Float[np.ndarray, "n 3"]
+    means: Float[np.ndarray, "n 3"]  # Centres [m], shape (n, 3)
+    # Logarithms of the standard deviations [m] along the axes of each, shape (n, 3).
     scales: Float[np.ndarray, "n 3"]
-    quats: Float[np.ndarray, "n 4"]
-    opacities: Float[np.ndarray, " n"]
+    quats: Float[np.ndarray, "n 4"]  # Orientations wxyz, not necessarily of unit length, shape (n, 4)
+    opacities: Float[np.ndarray, " n"]  # Logits of the opacities, shape (n,)
+    # Coefficients of spherical harmonics of degrees 0 to 3, shape (n, k, 3) with k = 1, 4, 9 or 16.
     colours: Float[np.ndarray, "n k 3"]
 
     def __len__(self) -> int:

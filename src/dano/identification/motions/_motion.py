@@ -24,7 +24,7 @@ from dano.maths import (
     quat_multiply,
     quat_rotate,
 )
-from dano.scene import Layout, Scene, State, Trajectory
+from dano.scene import Scene, State, StateLayout, Trajectory
 
 if TYPE_CHECKING:
     from dano.vision import Tracked
@@ -82,39 +82,30 @@ _INCONSISTENT = 0.5
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Motion:
-    """Observed motion of some bodies. What was not observed is NaN.
+    """Observed motion of some bodies. What was not observed is NaN."""
 
-    Attributes:
-        times: Of the frames [s], increasing, shape (T,).
-        position: Of `point` [m, W], shape (T, n, 3).
-        orientation: Unit quaternions wxyz, body → world, shape (T, n, 4).
-        velocity: Of `point` [m/s, W], shape (T, n, 3).
-        omega: [rad/s, B], shape (T, n, 3).
-        names: Names of the n bodies.
-        point: Whether positions are those of the centres of mass or of the origins of the field frames (F).
-        lag: How long before a frame its velocities hold [s]: half a timestep in a `Trajectory`, because
-            x⁺ = x + h v⁺; 0 for measured ones.
-        covariance: Of each pose, or None if no more is known than one noise for all: of the position [m, W],
-            then of the rotation vector [rad, B] by which the true orientation follows the observed one,
-            shape (T, n, 6, 6); NaN where it is unknown.
-        alike: By how much poses with a covariance may be off in all frames alike, as standard deviations: an
-            offset, in sizes of the body, a turn [rad], and a share by which the body goes too far. None: not
-            at all, and covariances are those of independent errors.
-        q: Coordinates of the joint that each body hangs on [rad or m], or None if they were not observed,
-            shape (T, n, 3): as many numbers as the joint has, then zeros. Poses of such a motion follow from
-            them, and do not count beside them.
-    """
-
-    times: np.ndarray
-    position: np.ndarray
-    orientation: np.ndarray
-    velocity: np.ndarray
-    omega: np.ndarray
-    names: tuple[str, ...]
+    times: np.ndarray  # Of the frames [s], increasing, shape (T,)
+    position: np.ndarray  # Of `point` [m, W], shape (T, n, 3)
+    orientation: np.ndarray  # Unit quaternions wxyz, body → world, shape (T, n, 4)
+    velocity: np.ndarray  # Of `point` [m/s, W], shape (T, n, 3)
+    omega: np.ndarray  # [rad/s, B], shape (T, n, 3)
+    names: tuple[str, ...]  # Names of the n bodies
+    # Whether positions are those of the centres of mass or of the origins of the field frames (F).
     point: str = "com"
+    # How long before a frame its velocities hold [s]: half a timestep in a `Trajectory`, because x⁺ = x + h
+    # v⁺; 0 for measured ones.
     lag: float = 0.0
+    # Of each pose, or None if no more is known than one noise for all: of the position [m, W], then of the
+    # rotation vector [rad, B] by which the true orientation follows the observed one, shape (T, n, 6, 6); NaN
+    # where it is unknown.
     covariance: np.ndarray | None = None
+    # By how much poses with a covariance may be off in all frames alike, as standard deviations: an offset,
+    # in sizes of the body, a turn [rad], and a share by which the body goes too far. None: not at all, and
+    # covariances are those of independent errors.
     alike: tuple[float, float, float] | None = None
+    # Coordinates of the joint that each body hangs on [rad or m], or None if they were not observed, shape
+    # (T, n, 3): as many numbers as the joint has, then zeros. Poses of such a motion follow from them, and do
+    # not count beside them.
     q: np.ndarray | None = None
 
     @classmethod
@@ -419,23 +410,23 @@ def _check_rotation(motion: Motion) -> None:
             )
 
 
-def joint_table(layout: Layout, q: Float[Array, "t k"]) -> Float[Array, "t n 3"]:
+def joint_table(layout: StateLayout, q: Float[Array, "t k"]) -> Float[Array, "t n 3"]:
     """Joint coordinates by the bodies that hang on the joints, as `Motion.q` has them for all n bodies."""
     bodies, parts = _places(layout)
     return jnp.zeros((q.shape[0], layout.bodies, JOINT_NUMBERS), q.dtype).at[:, bodies, parts].set(q)
 
 
-def joint_numbers(layout: Layout, table: np.ndarray) -> np.ndarray:
+def joint_numbers(layout: StateLayout, table: np.ndarray) -> np.ndarray:
     """Joint coordinates (k,) from a row of `joint_table`, shape (n, 3)."""
     return table[_places(layout)]
 
 
-def joint_widths(layout: Layout) -> np.ndarray:
+def joint_widths(layout: StateLayout) -> np.ndarray:
     """How many numbers of its own the joint of each body has, shape (n,)."""
     return np.bincount(_places(layout)[0], minlength=layout.bodies)
 
 
-def _places(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+def _places(layout: StateLayout) -> tuple[np.ndarray, np.ndarray]:
     """Body, and which of the coordinates of its joint, of each coordinate."""
     joints = layout.with_coordinates
     bodies = [layout.children[j] for j in joints]

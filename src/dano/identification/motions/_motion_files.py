@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,6 +51,14 @@ class _Read(NamedTuple):
     notes: list[str]  # What to say of it
 
 
+_CHOICES = {
+    "order": ("wxyz", "xyzw"),
+    "point": ("com", "origin"),
+    "time_unit": list(logs.TIME_UNITS),
+    "length_unit": list(logs.LENGTH_UNITS),
+}
+
+
 def load_motion(
     path: str | os.PathLike[str],
     *,
@@ -88,18 +96,12 @@ def load_motion(
             see `Motion.create`.
     """
     source = checked_input(path)
-    if order is not None:
-        checks.checked_choice("order", order, ("wxyz", "xyzw"))
-    if point is not None:
-        checks.checked_choice("point", point, ("com", "origin"))
+    given = {"order": order, "point": point, "time_unit": time_unit, "length_unit": length_unit}
+    for name, value in given.items():
+        if value is not None:
+            checks.checked_choice(name, value, _CHOICES[name])
     if rate is not None:
         rate = checks.checked_number("rate", rate, above=0)
-    for name, value, units in (
-        ("time_unit", time_unit, logs.TIME_UNITS),
-        ("length_unit", length_unit, logs.LENGTH_UNITS),
-    ):
-        if value is not None:
-            checks.checked_choice(name, value, list(units))
     if names is not None:
         names = (names,) if isinstance(names, str) else checks.checked_items("names", names, str)
     suffix = source.suffix.lower()
@@ -116,12 +118,7 @@ def load_motion(
             for key, value in arrays.items()
         }
     if "times" not in arrays:
-        if rate is None:
-            raise ValueError(f"{source} has no times: give the rate [frames/s]")
-        frames = {len(value) for key, value in arrays.items() if key in QUANTITIES}
-        if len(frames) != 1:
-            raise ValueError(f"{source} must hold as many rows of each quantity, got {sorted(frames)}")
-        arrays["times"] = np.arange(frames.pop()) / rate
+        arrays["times"] = _times_at(rate, arrays, source)
         read = read._replace(time_unit=1.0)
     stated = str(arrays.pop("point", "com" if point is None else point))
     try:
@@ -141,6 +138,20 @@ def load_motion(
     if notes:
         warnings.warn(f"{source}: {'; '.join(notes)}", UserWarning, stacklevel=2)
     return motion
+
+
+def _times_at(rate: float | None, arrays: Mapping[str, np.ndarray], source: Path) -> np.ndarray:
+    """Times of frames at a rate.
+
+    Raises:
+        ValueError: If it is not given, or quantities have other numbers of rows.
+    """
+    if rate is None:
+        raise ValueError(f"{source} has no times: give the rate [frames/s]")
+    frames = {len(value) for key, value in arrays.items() if key in QUANTITIES}
+    if len(frames) != 1:
+        raise ValueError(f"{source} must hold as many rows of each quantity, got {sorted(frames)}")
+    return np.arange(frames.pop()) / rate
 
 
 def _mend(

@@ -181,42 +181,27 @@ _NAMES = ("mass", "centre", "inertia")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Load:
-    """What a sensor, or the last link of an arm, holds, in its frame S. NaN: not observed.
+    """What a sensor, or the last link of an arm, holds, in its frame S. NaN: not observed."""
 
-    Attributes:
-        mass: [kg].
-        centre: Of mass [m, S], shape (3,).
-        inertia: About the centre of mass [kg m², axes of S], shape (3, 3).
-        standard_errors: Of these three, by name, in the same shapes; infinite where not observed.
-        force_bias: What the sensor shows without a load [N, S], at the middle of the log.
-        torque_bias: The same [N m, S].
-        drift: How much both change over the whole log [N, N m], shape (6,); zeros where they do not.
-        force_noise: Standard deviation of a force [N].
-        torque_noise: Of a torque [N m].
-        joint_bias: Constant part of the torques of an arm's joints [N m], shape (k,); None for the log of a
-            wrist, as are the other three. What belongs to a wrist is NaN for an arm.
-        joint_friction: Of each joint: Coulomb's [N m] and viscous [N m s/rad], shape (k, 2).
-        joint_noise: Standard deviation of each joint's torque [N m], shape (k,).
-        joint_drift: How much the bias of each joint changes over the whole log [N m], shape (k,); zeros where
-            it does not.
-        unobserved: Which of mass, centre, inertia the log cannot decide.
-        messages: What was found odd or corrected, in words.
-    """
-
-    mass: float
-    centre: np.ndarray
-    inertia: np.ndarray
+    mass: float  # [kg]
+    centre: np.ndarray  # Of mass [m, S], shape (3,)
+    inertia: np.ndarray  # About the centre of mass [kg m², axes of S], shape (3, 3)
+    # Of these three, by name, in the same shapes; infinite where not observed.
     standard_errors: dict[str, np.ndarray]
-    force_bias: np.ndarray
-    torque_bias: np.ndarray
-    drift: np.ndarray
-    force_noise: float
-    torque_noise: float
-    unobserved: tuple[str, ...]
-    messages: tuple[str, ...]
+    force_bias: np.ndarray  # What the sensor shows without a load [N, S], at the middle of the log
+    torque_bias: np.ndarray  # The same [N m, S]
+    drift: np.ndarray  # How much both change over the whole log [N, N m], shape (6,); zeros where they do not
+    force_noise: float  # Standard deviation of a force [N]
+    torque_noise: float  # Of a torque [N m]
+    unobserved: tuple[str, ...]  # Which of mass, centre, inertia the log cannot decide
+    messages: tuple[str, ...]  # What was found odd or corrected, in words
+    # Constant part of the torques of an arm's joints [N m], shape (k,); None for the log of a wrist, as are
+    # the other three. What belongs to a wrist is NaN for an arm.
     joint_bias: np.ndarray | None = None
+    # Of each joint: Coulomb's [N m] and viscous [N m s/rad], shape (k, 2).
     joint_friction: np.ndarray | None = None
-    joint_noise: np.ndarray | None = None
+    joint_noise: np.ndarray | None = None  # Standard deviation of each joint's torque [N m], shape (k,)
+    # How much the bias of each joint changes over the whole log [N m], shape (k,); zeros where it does not.
     joint_drift: np.ndarray | None = None
 
     def interval(self, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -42,17 +42,11 @@ _FASTEST = 2e3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class JointLog:
-    """Coordinates and torques of an arm's joints. What was not measured is NaN.
+    """Coordinates and torques of an arm's joints. What was not measured is NaN."""
 
-    Attributes:
-        times: [s], increasing, shape (T,).
-        q: Of the joints [rad, m], in the order of the scene's, shape (T, k).
-        torque: That drives them [N m, N], shape (T, k).
-    """
-
-    times: np.ndarray
-    q: np.ndarray
-    torque: np.ndarray
+    times: np.ndarray  # [s], increasing, shape (T,)
+    q: np.ndarray  # Of the joints [rad, m], in the order of the scene's, shape (T, k)
+    torque: np.ndarray  # That drives them [N m, N], shape (T, k)
 
     @classmethod
     def create(cls, times: Numbers, *, q: Numbers, torque: Numbers) -> "JointLog":

@@ -47,21 +47,13 @@ _UNITS = {
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class WristLog:
-    """What a force and torque sensor felt while it moved. S is its frame; what was not measured is NaN.
+    """What a force and torque sensor felt while it moved. S is its frame; what was not measured is NaN."""
 
-    Attributes:
-        times: [s], increasing, shape (T,).
-        position: Of the sensor's origin [m, W], shape (T, 3).
-        orientation: Unit quaternions wxyz, S → W, shape (T, 4).
-        force: [N, S], shape (T, 3).
-        torque: About the sensor's origin [N m, S], shape (T, 3).
-    """
-
-    times: np.ndarray
-    position: np.ndarray
-    orientation: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
+    times: np.ndarray  # [s], increasing, shape (T,)
+    position: np.ndarray  # Of the sensor's origin [m, W], shape (T, 3)
+    orientation: np.ndarray  # Unit quaternions wxyz, S → W, shape (T, 4)
+    force: np.ndarray  # [N, S], shape (T, 3)
+    torque: np.ndarray  # About the sensor's origin [N m, S], shape (T, 3)
 
     @classmethod
     def create(

@@ -212,15 +212,10 @@ def open_on(
 
 
 class Viewer:
-    """A running page; `stop` ends it.
+    """A running page; `stop` ends it."""
 
-    Attributes:
-        port: Where it listens.
-        url: Its address on this machine.
-    """
-
-    port: int
-    url: str
+    port: int  # Where it listens
+    url: str  # Its address on this machine
 
     def __init__(self, server: Any, end: Callable[[], None] | None = None):
         """Made by `view`, `view_field` and `view_capture`.

@@ -259,13 +259,9 @@ def _with_mass(name: str, scene: Scene, value: float) -> Scene:
 
 
 class LiveView:
-    """A page in the browser that shows the step that a scene has just made (host).
+    """A page in the browser that shows the step that a scene has just made (host)."""
 
-    Attributes:
-        url: Its address on this machine.
-    """
-
-    url: str
+    url: str  # Its address on this machine
 
     def __init__(self, scene: Scene, state: State, *, port: int = 8080, host: str = "127.0.0.1"):
         """Open the page.

@@ -16,7 +16,7 @@ import numpy as np
 from dano.checks import checked_count, checked_path, shown
 from dano.vision.capture._camera import PosedCamera
 from dano.vision.capture._capture import Capture, SPLITS, View
-from dano.vision.capture._pictures import read_mask, read_picture, Turned
+from dano.vision.capture._pictures import PictureTurn, read_mask, read_picture
 from dano.vision.capture.masks import cut_out
 
 _HOLD_OUT = 8
@@ -315,7 +315,7 @@ def _is_set(value: Any) -> bool:
     return bool(value)
 
 
-def _is_of_upright(path: Path, turned: Turned, values: dict[str, Any]) -> bool:
+def _is_of_upright(path: Path, turned: PictureTurn, values: dict[str, Any]) -> bool:
     """Whether a camera is that of the upright picture, or of the pixels as they are stored.
 
     COLMAP, instant-ngp and others do not heed how a camera was held; `dano poses` does, and says `units`.

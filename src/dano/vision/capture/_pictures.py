@@ -59,7 +59,7 @@ class Picture(NamedTuple):
         return np.rint(255 * (self.colours @ weights)).astype(np.uint8)
 
 
-def read_picture(file: Path, upright: Callable[["Turned"], bool] = lambda turned: True) -> Picture:
+def read_picture(file: Path, upright: Callable[["PictureTurn"], bool] = lambda turned: True) -> Picture:
     """Read a picture.
 
     Args:
@@ -71,7 +71,7 @@ def read_picture(file: Path, upright: Callable[["Turned"], bool] = lambda turned
         ImportError: If pillow is missing, or pillow-heif for a picture of an iPhone.
     """
     picture = _opened(file)
-    turned = Turned(file, picture.size, int(picture.getexif().get(_ORIENTATION, 1) or 1))
+    turned = PictureTurn(file, picture.size, int(picture.getexif().get(_ORIENTATION, 1) or 1))
     stated = picture.getexif().get_ifd(_EXIF).get(_FOCAL_35)
     focal = float(stated or 0) / _FULL_FRAME * max(picture.size)
     if turned.orientation not in range(2, 9):
@@ -85,7 +85,7 @@ def read_picture(file: Path, upright: Callable[["Turned"], bool] = lambda turned
     return Picture(colours, alpha, premultiplied, turned.orientation, focal if focal > 0 else None)
 
 
-class Turned(NamedTuple):
+class PictureTurn(NamedTuple):
     """A picture that was not held upright."""
 
     file: Path  # Its file

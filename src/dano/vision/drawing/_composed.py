@@ -6,6 +6,7 @@ it scatters within itself; what reaches it is the light that all others let thro
 neural scattering functions, Yu et al. 2020, "Learning Object-Centric Neural Scattering Functions").
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,14 +27,15 @@ from dano.vision.radiance import (
     AbstractSurface,
     composite,
     DRAWING,
-    Picture,
     pixel_order,
+    RenderedPicture,
     Sampling,
     section_weights,
     sections,
     Share,
     stratified_edges,
     transmittance,
+    Vectors,
 )
 
 _CHUNK = 1024
@@ -52,21 +54,14 @@ _GONE = 1e-6
 
 
 class Part(eqx.Module):
-    """A model somewhere.
+    """A model somewhere."""
 
-    Attributes:
-        model: What it looks like.
-        rotation: Field frame → world, shape (3, 3).
-        position: Of the field frame [m, W], shape (3,).
-        sharpness: Of its surface [1/m], if it has one.
-    """
+    model: AbstractModel  # What it looks like
+    rotation: Float[Array, "3 3"]  # Field frame → world, shape (3, 3)
+    position: Float[Array, "3"]  # Of the field frame [m, W], shape (3,)
+    sharpness: Float[Array, ""]  # Of its surface [1/m], if it has one
 
-    model: AbstractModel
-    rotation: Float[Array, "3 3"]
-    position: Float[Array, "3"]
-    sharpness: Float[Array, ""]
-
-    def local(self, origin: Float[Array, "n 3"], direction: Float[Array, "n 3"], limit: Array) -> Rays:
+    def local(self, origin: Vectors, direction: Vectors, limit: Array) -> Rays:
         """Rays [W] in the model's frame, from where they enter its box to where they leave it.
 
         Args:
@@ -117,17 +112,13 @@ class PaintedSolid(AbstractSurface):
         room = jnp.broadcast_to(0.02 * jnp.max(bounds[1] - bounds[0]), (3,))
         return bounds + jnp.stack([-room, room])
 
-    def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def distance_at(self, points: Vectors) -> Float[Array, " n"]:
         """Signed distances [m] of the shape."""
         return self.shape.sdf_jet(points.T, 0)
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """Lambert's law: albedo times the cosine to the light, as sRGB."""
         _, slope = self.shape.sdf_jet(points.T, 1)
         normal = slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-12)[:, None]
@@ -147,17 +138,13 @@ class PaintedMedium(AbstractMedium):
         """Of the grid."""
         return self.grid.bounds
 
-    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def density_at(self, points: Vectors) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m]."""
         return self.scale * self.grid.jet(points.T, 0)
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """The albedo as sRGB; no normals."""
         return jnp.broadcast_to(_encoded(self.albedo)[None], points.shape), jnp.zeros_like(points)
 
@@ -170,7 +157,7 @@ def compose(
     item_lights: dict[int, Sequence[Light]] | None = None,
     ambient: int | float = 0.0,
     sampling: Sampling = DRAWING,
-) -> Picture:
+) -> RenderedPicture:
     """Volume-render several objects together, with the light that each lets through to the others.
 
     Unlike `render`, which draws films of solids quickly, this knows transparency everywhere: overlapping
@@ -233,7 +220,7 @@ def compose(
     colour, opacity, depth, which = columns
     identity = np.where(which >= 0, np.array([*numbers, -1])[which], -1).astype(np.int32)
     shape = camera.height, camera.width
-    return Picture(
+    return RenderedPicture(
         colour.reshape(*shape, 3), opacity.reshape(shape), depth.reshape(shape), identity.reshape(shape)
     )
 
@@ -308,12 +295,12 @@ def _composed(parts, planes, lamps, origin, directions, ambient, sampling):
 def through(
     parts: tuple[Part, ...],
     lamps: Sequence[tuple[Light, ...]],
-    origins: Float[Array, "n 3"],
-    directions: Float[Array, "n 3"],
+    origins: Vectors,
+    directions: Vectors,
     limit: Float[Array, " n"],
     ambient: float | Float[Array, ""] | None,
     sampling: Sampling,
-) -> tuple[Float[Array, "n 3"], Float[Array, " n"], list[Float[Array, " n"]], Float[Array, " n"]]:
+) -> tuple[Vectors, Float[Array, " n"], list[Float[Array, " n"]], Float[Array, " n"]]:
     """What rays [W] see of parts before they end.
 
     Args:
@@ -335,11 +322,20 @@ def through(
     weights, clear = shared_weights([edges for edges, _ in found], [alpha for _, alpha in found], n)
     colour, depth = jnp.zeros((n, 3), jnp.float32), jnp.zeros(n, jnp.float32)
     shares = []
-    for i in range(len(parts)):
-        seen, distance, share = _sent(
-            parts, i, lamps[i], rays[i], found[i][0], weights[i], origins, directions, ambient, sampling
-        )
-        colour, depth = colour + seen, depth + distance
+    for i, (own, (edges, _), weight) in enumerate(zip(rays, found, weights, strict=True)):
+        middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+        k = min(sampling.colours, weight.shape[1])
+        _, chosen = jax.lax.top_k(weight, k)
+        some = jnp.take_along_axis(weight, chosen, axis=1)
+        t = jnp.take_along_axis(middle, chosen, axis=1)
+        world = (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3)
+        view = jnp.repeat(own.direction, k, axis=0)
+        send = functools.partial(radiance, parts, i, lamps[i], world, own.at(t), view, ambient)
+        light = jax.lax.cond(jnp.any(weight > 0), send, lambda world=world: jnp.zeros_like(world))
+        share = jnp.sum(weight, axis=1)
+        whole = (share / jnp.maximum(jnp.sum(some, axis=1), _GONE))[:, None]
+        colour = colour + composite(some, light.reshape(n, k, 3)) * whole
+        depth = depth + jnp.sum(weight * middle, axis=1)
         shares.append(share)
     return colour, depth, shares, clear
 
@@ -390,26 +386,6 @@ def shared_weights(
     return weights, jnp.exp(-passed[:, -1])
 
 
-def _sent(parts, i, lamps, rays, edges, weights, origins, directions, ambient, sampling):
-    """Light of one part along rays, its share of their mean depth, and its opacity."""
-    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-    k = min(sampling.colours, weights.shape[1])
-    _, chosen = jax.lax.top_k(weights, k)
-    some = jnp.take_along_axis(weights, chosen, axis=1)
-    t = jnp.take_along_axis(middle, chosen, axis=1)
-    world = (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3)
-    local, view = rays.at(t), jnp.repeat(rays.direction, k, axis=0)
-    light = jax.lax.cond(
-        jnp.any(weights > 0),
-        lambda: radiance(parts, i, lamps, world, local, view, ambient),
-        lambda: jnp.zeros_like(world),
-    )
-    share = jnp.sum(weights, axis=1)
-    whole = (share / jnp.maximum(jnp.sum(some, axis=1), _GONE))[:, None]
-    colour = composite(some, light.reshape(len(share), k, 3)) * whole
-    return colour, jnp.sum(weights * middle, axis=1), share
-
-
 def radiance(parts, i, lamps, world, local, view, ambient):
     """SRGB that points of one part send against directions of view, under lamps seen through the others."""
     part = parts[i]
@@ -453,7 +429,7 @@ def _reaching(parts, points, towards, away):
 
 
 def reached_through(
-    part: Part, points: Float[Array, "n 3"], towards: Float[Array, "n 3"], away: Float[Array, " n"]
+    part: Part, points: Vectors, towards: Vectors, away: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """Transmittance of a part between points [m, W] and a lamp at distances `away` [m]."""
     rays = part.local(points, towards, away)

@@ -26,30 +26,20 @@ M = TypeVar("M", bound=eqx.Module)
 
 
 class Item(eqx.Module):
-    """A field, where it is, and how it looks.
+    """A field, where it is, and how it looks."""
 
-    Attributes:
-        shape: What is drawn of a solid, in float32: the field itself if it is a shape, else the signed
-            distance of its level surface; None if it is translucent.
-        medium: The density that is drawn as a translucent medium of one colour, in float32, else None.
-        model: The look that photographs taught, else None.
-        sharpness: Of the model's surface [1/m], if it has one.
-        pose: Field frame → world.
-        colour: sRGB in [0, 1], shape (3,).
-        density_scale: Extinction [1/m] of a medium per unit of its density.
-        centre: Middle of a ball around the item [m, F]; zero for a half-space.
-        radius: Radius of that ball [m]; infinite for a half-space.
-    """
-
+    # What is drawn of a solid, in float32: the field itself if it is a shape, else the signed distance of its
+    # level surface; None if it is translucent.
     shape: fields.AbstractShape | None
+    # The density that is drawn as a translucent medium of one colour, in float32, else None.
     medium: fields.GridField | None
-    model: radiance.AbstractModel | None
-    sharpness: float
-    pose: maths.Pose
-    colour: Float[np.ndarray, "3"]
-    density_scale: float
-    centre: Float[np.ndarray, "3"]
-    radius: float
+    model: radiance.AbstractModel | None  # The look that photographs taught, else None
+    sharpness: float  # Of the model's surface [1/m], if it has one
+    pose: maths.Pose  # Field frame → world
+    colour: Float[np.ndarray, "3"]  # sRGB in [0, 1], shape (3,)
+    density_scale: float  # Extinction [1/m] of a medium per unit of its density
+    centre: Float[np.ndarray, "3"]  # Middle of a ball around the item [m, F]; zero for a half-space
+    radius: float  # Radius of that ball [m]; infinite for a half-space
 
     def __init__(
         self,

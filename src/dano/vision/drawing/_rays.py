@@ -16,13 +16,13 @@ from dano.native import (
     cpu_kernel,
     Features,
     Kernel,
-    Launch,
+    KernelLaunch,
     leaf_tables,
     Leaves,
     leaves_of,
     n_cores,
     Parameters,
-    Placed,
+    PlacedField,
     together,
 )
 from dano.vision.capture import box_interval
@@ -205,12 +205,12 @@ def _launch(
             parameters.put(place, value)
         if regular is not None:
             parameters.put("rays.regular", max(min(regular, end) - begin, 0))
-        works.append(Launch(kernel, parameters, -(-(end - begin) // block)))
+        works.append(KernelLaunch(kernel, parameters, -(-(end - begin) // block)))
     if works:
         together([functools.partial(_each, works[k :: n_cores()]) for k in range(min(n_cores(), len(works)))])
 
 
-def _each(works: Sequence[Launch]) -> None:
+def _each(works: Sequence[KernelLaunch]) -> None:
     for work in works:
         work()
 
@@ -238,7 +238,7 @@ def _tables(shapes: Sequence[AbstractShape]) -> _Tables:
 
 
 def _made(shapes: Sequence[AbstractShape]) -> _Tables:
-    leaves = [leaves_of(Placed.still(shape, np.float32)) for shape in shapes]
+    leaves = [leaves_of(PlacedField.still(shape, np.float32)) for shape in shapes]
     counts = [len(each) for each in leaves]
     bounds = [np.asarray(shape.bounds, float) for shape in shapes]
     parts = list(zip(np.cumsum([0, *counts])[:-1].tolist(), counts, bounds, strict=True))
@@ -249,7 +249,7 @@ def _made(shapes: Sequence[AbstractShape]) -> _Tables:
 
 
 @one_program
-def _leaf_tables(leaves: list[Placed]) -> Leaves:
+def _leaf_tables(leaves: list[PlacedField]) -> Leaves:
     return leaf_tables(leaves, jnp.float32)
 
 

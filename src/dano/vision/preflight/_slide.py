@@ -32,25 +32,15 @@ _END = 3
 
 
 class SlideCheck(NamedTuple):
-    """What a film says of itself.
+    """What a film says of itself."""
 
-    Attributes:
-        frames: Their number.
-        seconds: How long it lasts [s], as it was filmed.
-        blur: Median measure of blur, from 0, sharp, to 1.
-        marked: Whether the first frame shows a marker.
-        rests: Whether nothing moves at the end.
-        fastest: When most of the picture changes [s].
-        warnings: Sentences for the user.
-    """
-
-    frames: int
-    seconds: float
-    blur: float
-    marked: bool
-    rests: bool
-    fastest: float
-    warnings: tuple[str, ...]
+    frames: int  # Their number
+    seconds: float  # How long it lasts [s], as it was filmed
+    blur: float  # Median measure of blur, from 0, sharp, to 1
+    marked: bool  # Whether the first frame shows a marker
+    rests: bool  # Whether nothing moves at the end
+    fastest: float  # When most of the picture changes [s]
+    warnings: tuple[str, ...]  # Sentences for the user
 
 
 def check_slide(film: Film, options: PoseOptions) -> SlideCheck:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dano.checks import checked_items, checked_kind, checked_path
+from dano.checks import checked_items, checked_kind, checked_path, checked_progress
 from dano.extras import NETWORKS
 from dano.progress import Progress
 from dano.vision.capture import background_mask, is_plain, PosedCamera, read_picture, View
@@ -34,25 +34,15 @@ _SMALL = 400
 
 
 class WalkCheck(NamedTuple):
-    """What photographs say of themselves.
+    """What photographs say of themselves."""
 
-    Attributes:
-        photographs: How many there are.
-        looked_at: How many of them were looked at.
-        blur: Median measure of blur, from 0, sharp, to 1.
-        marked: How many of those looked at show a marker.
-        markers: Numbers of the markers.
-        masks: Where masks come from: "given", "network", "background" or "table".
-        warnings: Sentences for the user.
-    """
-
-    photographs: int
-    looked_at: int
-    blur: float
-    marked: int
-    markers: tuple[int, ...]
-    masks: str
-    warnings: tuple[str, ...]
+    photographs: int  # How many there are
+    looked_at: int  # How many of them were looked at
+    blur: float  # Median measure of blur, from 0, sharp, to 1
+    marked: int  # How many of those looked at show a marker
+    markers: tuple[int, ...]  # Numbers of the markers
+    masks: str  # Where masks come from: "given", "network", "background" or "table"
+    warnings: tuple[str, ...]  # Sentences for the user
 
 
 def check_walk(
@@ -82,7 +72,7 @@ def check_walk(
         raise ValueError(
             f"photographs must be {FEWEST} at least, 30 to 60 from all sides are usual, got {len(files)}"
         )
-    told = progress or (lambda _what, _share: None)
+    told = checked_progress(progress)
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, _MOST).round().astype(int))]
     folder = mask_folder(files[0], None if masks is None else checked_path("masks", masks))
     seen, broken = _read(chosen, folder, told)

@@ -17,9 +17,14 @@ from dano.vision.radiance._models import (
     Seen as Seen,
     Share as Share,
     SurfaceModel as SurfaceModel,
+    Vectors as Vectors,
 )
 from dano.vision.radiance._osf import OSF as OSF
-from dano.vision.radiance._picture import Picture as Picture, picture as picture, pixel_order as pixel_order
+from dano.vision.radiance._picture import (
+    picture as picture,
+    pixel_order as pixel_order,
+    RenderedPicture as RenderedPicture,
+)
 from dano.vision.radiance._volume import (
     composite as composite,
     section_weights as section_weights,

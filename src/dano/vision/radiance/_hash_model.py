@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dano.archive import read_archive, write_archive
 from dano.fields import HashGrid
 from dano.maths import Numbers
-from dano.vision.radiance._models import AbstractMedium, Network, Share
+from dano.vision.radiance._models import AbstractMedium, Network, Share, Vectors
 
 FORMAT, VERSION = "dano-hash-model", 1
 _WIDTH, _CODE = 64, 16  # as Müller et al.
@@ -23,22 +23,14 @@ class HashModel(AbstractMedium):
 
     Density is exp(h₀)/`scale`, h the 16 outputs of the first network; the second takes h and the directions
     of view and light to a colour.
-
-    Attributes:
-        grid: Features of places in the box, as a unit cube.
-        trunk: Features → h.
-        head: (h, view, light) → raw colour.
-        corners: Box [m], shape (2, 3); nothing is outside of it.
-        scale: Length [m] over which a density of h₀ = 0 dims light by 1/e.
-        lit: Whether the colour depends on a light (static).
     """
 
-    grid: HashGrid
-    trunk: Network
-    head: Network
-    corners: Float[Array, "2 3"]
-    scale: Float[Array, ""]
-    lit: bool = eqx.field(static=True)
+    grid: HashGrid  # Features of places in the box, as a unit cube
+    trunk: Network  # Features → h
+    head: Network  # (h, view, light) → raw colour
+    corners: Float[Array, "2 3"]  # Box [m], shape (2, 3); nothing is outside of it
+    scale: Float[Array, ""]  # Length [m] over which a density of h₀ = 0 dims light by 1/e
+    lit: bool = eqx.field(static=True)  # Whether the colour depends on a light (static)
 
     @classmethod
     def create(cls, bounds: Numbers, grid: HashGrid, *, lit: bool, key: PRNGKeyArray) -> "HashModel":
@@ -66,13 +58,13 @@ class HashModel(AbstractMedium):
         """`corners`."""
         return self.corners
 
-    def _code_at(self, points: Float[Array, "n 3"]) -> tuple[Float[Array, "n 16"], Array]:
+    def _code_at(self, points: Vectors) -> tuple[Float[Array, "n 16"], Array]:
         lower, upper = self.bounds.astype(points.dtype)
         inside = jnp.all((points >= lower[None]) & (points <= upper[None]), axis=1)
         unit = jnp.clip((points - lower[None]) / (upper - lower)[None], 0, 1)
         return self.trunk(self.grid(unit)), inside
 
-    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def density_at(self, points: Vectors) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m], zero outside of the bounds."""
         code, inside = self._code_at(points)
         # Beyond e¹⁵ nothing gets through anyway, and gradients stay finite.
@@ -80,12 +72,8 @@ class HashModel(AbstractMedium):
         return jnp.where(inside, density, 0)
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """See `AbstractModel.colour`; no normals."""
         code, _ = self._code_at(points)
         inputs = [code, view_share * view, *([light] if self.lit else [])]

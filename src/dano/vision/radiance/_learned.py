@@ -15,7 +15,7 @@ from dano.fields import AbstractField, check_order, Jet, redistanced, SignedDist
 from dano.maths import Numbers, on_device
 from dano.vision.capture import AbstractCamera
 from dano.vision.radiance._models import Appearance, Network, SurfaceModel
-from dano.vision.radiance._picture import Picture, picture
+from dano.vision.radiance._picture import picture, RenderedPicture
 
 FORMAT, VERSION = "dano-learned-field", 1
 
@@ -55,21 +55,13 @@ _USUAL = Doubt()
 
 
 class LearnedField(AbstractField):
-    """An occupancy probability φ = 1/(1 + exp(s d)) ∈ [0, 1] around a learned signed distance d.
+    """An occupancy probability φ = 1/(1 + exp(s d)) ∈ [0, 1] around a learned signed distance d."""
 
-    Attributes:
-        solid: The solid {d < 0}, d made a signed distance again after training.
-        sharpness: s [1/m].
-        model: What was trained, for pictures.
-        drawn_sharpness: Sharpness [1/m] of the model's surface in pictures.
-        doubt: By how much it may be beside the true object.
-    """
-
-    solid: SignedDistanceGrid
-    sharpness: Float[Array, ""]
-    model: SurfaceModel
-    drawn_sharpness: Float[Array, ""]
-    doubt: Doubt = eqx.field(static=True, default=_USUAL)
+    solid: SignedDistanceGrid  # The solid {d < 0}, d made a signed distance again after training
+    sharpness: Float[Array, ""]  # s [1/m]
+    model: SurfaceModel  # What was trained, for pictures
+    drawn_sharpness: Float[Array, ""]  # Sharpness [1/m] of the model's surface in pictures
+    doubt: Doubt = eqx.field(static=True, default=_USUAL)  # By how much it may be beside the true object
 
     @classmethod
     def from_model(cls, model: SurfaceModel, drawn_sharpness: float, doubt: Doubt = _USUAL) -> "LearnedField":
@@ -156,7 +148,7 @@ class LearnedField(AbstractField):
         cut = eqx.tree_at(lambda m: m.distance, model, jnp.maximum(model.distance, below[None, None]))
         return LearnedField.from_model(cut, float(self.drawn_sharpness), self.doubt)
 
-    def picture(self, camera: AbstractCamera, light: Numbers | None = None) -> Picture:
+    def picture(self, camera: AbstractCamera, light: Numbers | None = None) -> RenderedPicture:
         """What a camera sees.
 
         Args:

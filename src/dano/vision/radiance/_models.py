@@ -33,18 +33,18 @@ from dano.vision.radiance._volume import (
 )
 
 Share = float | Float[Array, ""]
+Vectors = Float[Array, "n 3"]
+"""One a point."""
+Edges = Float[Array, "rays edges"]
+"""Distances along rays between which sections lie [m]."""
+Sections = Float[Array, "rays sections"]
 
 
 class Network(eqx.Module):
-    """A perceptron with smooth activations on rows, in the layout that trains fastest on a CPU.
+    """A perceptron with smooth activations on rows, in the layout that trains fastest on a CPU."""
 
-    Attributes:
-        weights: One matrix (inputs, outputs) a layer.
-        biases: One vector a layer.
-    """
-
-    weights: tuple[Float[Array, "_ _"], ...]
-    biases: tuple[Float[Array, " _"], ...]
+    weights: tuple[Float[Array, "_ _"], ...]  # One matrix (inputs, outputs) a layer
+    biases: tuple[Float[Array, " _"], ...]  # One vector a layer
 
     @classmethod
     def create(cls, sizes: tuple[int, ...], key: PRNGKeyArray) -> "Network":
@@ -68,22 +68,14 @@ class Appearance(eqx.Module):
 
     ρ(x, ω_light, ω_out) of an object-centric neural scattering function (Yu et al. 2020), with the scattered
     light of the whole object in it: features on a grid say where, a small network what that means.
-
-    Attributes:
-        features: What the network knows about a place, shape (mx, my, mz, k).
-        network: (features, normal, view, light) → colour.
-        origin: Position [m] of node (0, 0, 0).
-        spacing: Distance between nodes [m].
-        lit: Whether the light of the photographs is known (static).
-        near_light: Whether it is a position instead of a direction (static).
     """
 
-    features: Float[Array, "mx my mz k"]
-    network: Network
-    origin: Float[Array, "3"]
-    spacing: Float[Array, ""]
-    lit: bool = eqx.field(static=True)
-    near_light: bool = eqx.field(static=True)
+    features: Float[Array, "mx my mz k"]  # What the network knows about a place, shape (mx, my, mz, k)
+    network: Network  # (features, normal, view, light) → colour
+    origin: Float[Array, "3"]  # Position [m] of node (0, 0, 0)
+    spacing: Float[Array, ""]  # Distance between nodes [m]
+    lit: bool = eqx.field(static=True)  # Whether the light of the photographs is known (static)
+    near_light: bool = eqx.field(static=True)  # Whether it is a position instead of a direction (static)
 
     @classmethod
     def create(
@@ -128,12 +120,12 @@ class Appearance(eqx.Module):
 
     def __call__(
         self,
-        points: Float[Array, "n 3"],
-        normal: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
+        points: Vectors,
+        normal: Vectors,
+        view: Vectors,
+        light: Vectors,
         view_share: Share = 1.0,
-    ) -> Float[Array, "n 3"]:
+    ) -> Vectors:
         """SRGB in [0, 1] sent from points.
 
         Args:
@@ -166,39 +158,26 @@ silhouette do not get worse.
 
 
 class Seen(NamedTuple):
-    """What rays see.
+    """What rays see."""
 
-    Attributes:
-        colour: Light of the object, without what is behind it, shape (rays, 3).
-        opacity: Share of the pixel that the object covers, shape (rays,).
-        depth: Mean distance of what is seen [m], shape (rays,); 0 where nothing is.
-        normal: Mean outward normal, shape (rays, 3), not of unit length.
-    """
-
-    colour: Float[Array, "rays 3"]
-    opacity: Float[Array, " rays"]
-    depth: Float[Array, " rays"]
-    normal: Float[Array, "rays 3"]
+    colour: Float[Array, "rays 3"]  # Light of the object, without what is behind it, shape (rays, 3)
+    opacity: Float[Array, " rays"]  # Share of the pixel that the object covers, shape (rays,)
+    depth: Float[Array, " rays"]  # Mean distance of what is seen [m], shape (rays,); 0 where nothing is
+    normal: Float[Array, "rays 3"]  # Mean outward normal, shape (rays, 3), not of unit length
 
 
 class Sampling(NamedTuple):
-    """How finely rays are sampled (static).
+    """How finely rays are sampled (static)."""
 
-    Attributes:
-        coarse: Sections that look for the object, without derivatives.
-        fine: Sections around it, which give the opacity.
-        colours: Of these, those seen most, whose colour is computed.
-        moves: Whether derivatives see the sections move with the surface. Without it they stand still, which
-            is wrong for what is seen inside an outline, and better behaved far from a match.
-        grazes: Whether one of the fine sections' edges lies where a ray is closest to a surface. Without it
-            what only grazes an object comes out too clear: the silhouette of a soap of 90 pixels was 0.2
-            pixels too small all around, by which it seems 2 % of its size nearer.
-    """
-
-    coarse: int = 48
-    fine: int = 16
-    colours: int = 5
+    coarse: int = 48  # Sections that look for the object, without derivatives
+    fine: int = 16  # Sections around it, which give the opacity
+    colours: int = 5  # Of these, those seen most, whose colour is computed
+    # Whether derivatives see the sections move with the surface. Without it they stand still, which is wrong
+    # for what is seen inside an outline, and better behaved far from a match.
     moves: bool = False
+    # Whether one of the fine sections' edges lies where a ray is closest to a surface. Without it what only
+    # grazes an object comes out too clear: the silhouette of a soap of 90 pixels was 0.2 pixels too small all
+    # around, by which it seems 2 % of its size nearer.
     grazes: bool = False
 
 
@@ -215,24 +194,16 @@ class AbstractModel(eqx.Module):
         """Lower and upper corner [m] of a box outside of which there is nothing."""
 
     @abc.abstractmethod
-    def alpha(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
+    def alpha(self, rays: Rays, edges: Edges, sharpness: Share) -> Sections:
         """Opacity of the sections between distances along rays."""
 
     @abc.abstractmethod
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """SRGB sent from points against directions of view, and unit outward normals there."""
 
-    def scouted(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> tuple[Float[Array, "rays sections"], Float[Array, "rays 1"]]:
+    def scouted(self, rays: Rays, edges: Edges, sharpness: Share) -> tuple[Sections, Float[Array, "rays 1"]]:
         """Where to sample finely; what calls it takes no derivatives of that.
 
         Returns:
@@ -241,9 +212,7 @@ class AbstractModel(eqx.Module):
         weights = section_weights(self.alpha(rays, edges, sharpness))
         return weights, 0.5 * (edges[:, :1] + edges[:, -1:])
 
-    def attached(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays edges"]:
+    def attached(self, rays: Rays, edges: Edges, sharpness: Share) -> Edges:
         """The same edges, with derivatives as if they moved along the rays with what is seen there."""
         del rays, sharpness
         return edges
@@ -253,12 +222,10 @@ class AbstractMedium(AbstractModel):
     """What has an extinction at every point."""
 
     @abc.abstractmethod
-    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def density_at(self, points: Vectors) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m]."""
 
-    def alpha(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
+    def alpha(self, rays: Rays, edges: Edges, sharpness: Share) -> Sections:
         """See `density_alpha`, with the density in the middle of each section."""
         middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
         return density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
@@ -272,18 +239,14 @@ class AbstractSurface(AbstractModel):
     """What has a soft surface: a signed distance, and an opacity as in NeuS (Wang et al. 2021)."""
 
     @abc.abstractmethod
-    def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def distance_at(self, points: Vectors) -> Float[Array, " n"]:
         """Signed distances [m] at points [m], negative inside."""
 
-    def alpha(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays sections"]:
+    def alpha(self, rays: Rays, edges: Edges, sharpness: Share) -> Sections:
         """See `surface_alpha`."""
         return surface_alpha(self._along(rays, edges), jnp.asarray(sharpness))
 
-    def scouted(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> tuple[Float[Array, "rays sections"], Float[Array, "rays 1"]]:
+    def scouted(self, rays: Rays, edges: Edges, sharpness: Share) -> tuple[Sections, Float[Array, "rays 1"]]:
         """See `surface_interest`; as blurred as sections are long, or the surface hides between two edges.
 
         Where the least gets through the distance is least, by the parabola through the least one of edges.
@@ -300,13 +263,11 @@ class AbstractSurface(AbstractModel):
         closest = jnp.take_along_axis(edges, least, axis=1) + shift * (edges[:, 1:2] - edges[:, :1])
         return surface_interest(distance, blurred), closest
 
-    def _along(self, rays: Rays, edges: Float[Array, "rays edges"]) -> Float[Array, "rays edges"]:
+    def _along(self, rays: Rays, edges: Edges) -> Edges:
         """Signed distances [m] at distances along rays."""
         return by_halves(lambda some, t: self.distance_at(some.at(t)).reshape(t.shape), rays, edges)
 
-    def attached(
-        self, rays: Rays, edges: Float[Array, "rays edges"], sharpness: Share
-    ) -> Float[Array, "rays edges"]:
+    def attached(self, rays: Rays, edges: Edges, sharpness: Share) -> Edges:
         """See `AbstractModel.attached`: with where a ray meets the surface (implicit function theorem).
 
         Without it the colour would stand still in space while the surface moves. Rays that graze keep their
@@ -326,13 +287,13 @@ class AbstractSurface(AbstractModel):
 class _Density(eqx.Module):
     model: AbstractMedium
 
-    def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def __call__(self, points: Vectors) -> Float[Array, " n"]:
         return self.model.density_at(points)
 
 
 def sections(
     model: AbstractModel, rays: Rays, sharpness: Share, sampling: Sampling, key: PRNGKeyArray | None = None
-) -> tuple[Float[Array, "rays edges"], Float[Array, "rays sections"]]:
+) -> tuple[Edges, Sections]:
     """Edges of the fine sections, around what coarse ones found, and their opacity; arguments as of `see`."""
     keys = (None, None) if key is None else jax.random.split(key)
     coarse = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
@@ -409,26 +370,19 @@ class _OnNodes(AbstractModel):
         """The grid."""
         return NodeGrid(np.asarray(self.origin, np.float64), float(self.spacing), self.shape)
 
-    def _index(self, points: Float[Array, "n 3"]) -> Float[Array, "3 n"]:
+    def _index(self, points: Vectors) -> Float[Array, "3 n"]:
         return ((points - self.origin[None]) / self.spacing).T
 
 
 class SurfaceModel(_OnNodes, AbstractSurface):
-    """A solid with a soft surface: a signed distance on a grid.
+    """A solid with a soft surface: a signed distance on a grid."""
 
-    Attributes:
-        distance: Signed distance at the nodes in units of `scale`, negative inside, shape (nx, ny, nz).
-        appearance: What its surface looks like.
-        origin: Position [m] of node (0, 0, 0).
-        spacing: Distance between nodes [m].
-        scale: Half the longest side of the box [m], so that numbers to learn are of order one.
-    """
-
+    # Signed distance at the nodes in units of `scale`, negative inside, shape (nx, ny, nz).
     distance: Float[Array, "nx ny nz"]
-    appearance: Appearance
-    origin: Float[Array, "3"]
-    spacing: Float[Array, ""]
-    scale: Float[Array, ""]
+    appearance: Appearance  # What its surface looks like
+    origin: Float[Array, "3"]  # Position [m] of node (0, 0, 0)
+    spacing: Float[Array, ""]  # Distance between nodes [m]
+    scale: Float[Array, ""]  # Half the longest side of the box [m], so that numbers to learn are of order one
 
     @classmethod
     def create(
@@ -455,17 +409,13 @@ class SurfaceModel(_OnNodes, AbstractSurface):
         """Signed distances at the nodes [m]."""
         return np.asarray(self.distance, np.float64) * float(self.scale)
 
-    def distance_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def distance_at(self, points: Vectors) -> Float[Array, " n"]:
         """Signed distances [m] at points [m]."""
         return value_at(self.distance, self._index(points)) * self.scale
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """See `AbstractModel.colour`; normals are the gradient of the distance, continuous between cells."""
         slope = smooth_slope_at(self.distance, self._index(points))
         normal = slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-12)[:, None]
@@ -473,19 +423,13 @@ class SurfaceModel(_OnNodes, AbstractSurface):
 
 
 class DensityModel(_OnNodes, AbstractMedium):
-    """A medium: extinction on a grid, as in a plain neural radiance field.
+    """A medium: extinction on a grid, as in a plain neural radiance field."""
 
-    Attributes:
-        raw: Numbers whose softplus is the density in units of 1/`spacing`, shape (nx, ny, nz).
-        appearance: What it looks like.
-        origin: Position [m] of node (0, 0, 0).
-        spacing: Distance between nodes [m].
-    """
-
+    # Numbers whose softplus is the density in units of 1/`spacing`, shape (nx, ny, nz).
     raw: Float[Array, "nx ny nz"]
-    appearance: Appearance
-    origin: Float[Array, "3"]
-    spacing: Float[Array, ""]
+    appearance: Appearance  # What it looks like
+    origin: Float[Array, "3"]  # Position [m] of node (0, 0, 0)
+    spacing: Float[Array, ""]  # Distance between nodes [m]
 
     @classmethod
     def create(
@@ -506,18 +450,14 @@ class DensityModel(_OnNodes, AbstractMedium):
         nx, ny, nz = self.raw.shape
         return nx, ny, nz
 
-    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def density_at(self, points: Vectors) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m]."""
         u = self._index(points)
         return jax.nn.softplus(value_at(self.raw, u)) / self.spacing
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """See `AbstractModel.colour`; a medium's normals are against the gradient of its density."""
         u = self._index(points)
         # Not learned through: fog has normals in all directions, and explaining shading by them makes noise.

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.archive import read_archive, write_archive
 from dano.maths import Numbers
-from dano.vision.radiance._models import AbstractMedium, Share
+from dano.vision.radiance._models import AbstractMedium, Share, Vectors
 
 FORMAT, VERSION = "dano-osf", 1
 # The architecture of michguo/osf, as above.
@@ -35,25 +35,16 @@ def encoded(x: Float[Array, "n k"], n_frequencies: int) -> Float[Array, "n e"]:
 
 
 class OSF(AbstractMedium):
-    """Density φ(x) and radiance transfer ρ(x, ω_light, ω_out) by one network.
+    """Density φ(x) and radiance transfer ρ(x, ω_light, ω_out) by one network."""
 
-    Attributes:
-        trunk: Weight (outputs, inputs) and bias of each of eight layers.
-        density_layer: Trunk → raw density.
-        bottleneck: Trunk → 256.
-        head: Bottleneck and encoded directions → 128.
-        colour_layer: Head → raw colour.
-        corners: Box [m] outside of which there is nothing, shape (2, 3).
-        scale: Length of a unit of the network's coordinates [m].
-    """
-
+    # Weight (outputs, inputs) and bias of each of eight layers.
     trunk: tuple[tuple[Float[Array, "_ _"], Float[Array, " _"]], ...]
-    density_layer: tuple[Float[Array, "1 _"], Float[Array, "1"]]
-    bottleneck: tuple[Float[Array, "_ _"], Float[Array, " _"]]
-    head: tuple[Float[Array, "_ _"], Float[Array, " _"]]
-    colour_layer: tuple[Float[Array, "3 _"], Float[Array, "3"]]
-    corners: Float[Array, "2 3"]
-    scale: Float[Array, ""]
+    density_layer: tuple[Float[Array, "1 _"], Float[Array, "1"]]  # Trunk → raw density
+    bottleneck: tuple[Float[Array, "_ _"], Float[Array, " _"]]  # Trunk → 256
+    head: tuple[Float[Array, "_ _"], Float[Array, " _"]]  # Bottleneck and encoded directions → 128
+    colour_layer: tuple[Float[Array, "3 _"], Float[Array, "3"]]  # Head → raw colour
+    corners: Float[Array, "2 3"]  # Box [m] outside of which there is nothing, shape (2, 3)
+    scale: Float[Array, ""]  # Length of a unit of the network's coordinates [m]
 
     @classmethod
     def create(
@@ -111,7 +102,7 @@ class OSF(AbstractMedium):
         """`corners`."""
         return self.corners
 
-    def _trunk_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n w"]:
+    def _trunk_at(self, points: Vectors) -> Float[Array, "n w"]:
         code = encoded(points / self.scale.astype(points.dtype), _POSITION_FREQUENCIES)
         h = code
         for i, layer in enumerate(self.trunk):
@@ -121,7 +112,7 @@ class OSF(AbstractMedium):
                 h = jnp.concatenate([code, h], axis=1)
         return h
 
-    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def density_at(self, points: Vectors) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m], zero outside of the bounds."""
         raw = _affine(self.density_layer, self._trunk_at(points))[:, 0]
         lower, upper = self.bounds.astype(points.dtype)
@@ -129,12 +120,8 @@ class OSF(AbstractMedium):
         return jnp.where(inside, jax.nn.relu(raw) / self.scale.astype(points.dtype), 0)
 
     def colour(
-        self,
-        points: Float[Array, "n 3"],
-        view: Float[Array, "n 3"],
-        light: Float[Array, "n 3"],
-        view_share: Share = 1.0,
-    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
+    ) -> tuple[Vectors, Vectors]:
         """ρ, a sigmoid stretched to [−0.1, 1.1] so that black and white can be reached; no normals."""
         middle = _affine(self.bottleneck, self._trunk_at(points))
         directions = [encoded(x, _DIRECTION_FREQUENCIES) for x in (view_share * view, light)]

@@ -15,19 +15,14 @@ _CHUNK = 4096
 """Rays per call: some tens of MB of intermediates."""
 
 
-class Picture(NamedTuple):
-    """What a camera sees of an object, in float32.
+class RenderedPicture(NamedTuple):
+    """What a camera sees of an object, in float32."""
 
-    Attributes:
-        colour: sRGB over black, shape (height, width, 3).
-        opacity: Share of each pixel that the object covers, (height, width).
-        depth: Mean distance from the camera of what is seen [m], (height, width); 0 where nothing is.
-        identity: Index of the object that is seen most, (height, width); −1 where more than half is empty.
-    """
-
-    colour: Float[np.ndarray, "height width 3"]
-    opacity: Float[np.ndarray, "height width"]
+    colour: Float[np.ndarray, "height width 3"]  # sRGB over black, shape (height, width, 3)
+    opacity: Float[np.ndarray, "height width"]  # Share of each pixel that the object covers, (height, width)
+    # Mean distance from the camera of what is seen [m], (height, width); 0 where nothing is.
     depth: Float[np.ndarray, "height width"]
+    # Index of the object that is seen most, (height, width); −1 where more than half is empty.
     identity: Int[np.ndarray, "height width"]
 
     def over(
@@ -46,7 +41,7 @@ def picture(
     sharpness: float = 1.0,
     *,
     sampling: Sampling = DRAWING,
-) -> Picture:
+) -> RenderedPicture:
     """Render a model through a camera, chunk by chunk."""
     pixels, rays = rays_of(camera, light, box, occupied)
     shape = camera.height, camera.width
@@ -64,7 +59,7 @@ def picture(
         depth[pixels[part]] = np.asarray(seen.depth)[:n]
     opacity = opacity.reshape(shape)
     identity = np.where(opacity > 0.5, 0, -1).astype(np.int32)
-    return Picture(colour.reshape(*shape, 3), opacity, depth.reshape(shape), identity)
+    return RenderedPicture(colour.reshape(*shape, 3), opacity, depth.reshape(shape), identity)
 
 
 @functools.lru_cache(maxsize=8)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from dano.archive import checked_output, replacing
-from dano.checks import checked_items, checked_optional, checked_path
+from dano.checks import checked_items, checked_optional, checked_path, checked_progress
 from dano.progress import Progress
 from dano.vision.capture import PosedCamera
 from dano.vision.structure._colmap import colmap, opencv, quiet
@@ -64,57 +64,32 @@ _STANDS_STILL = 0.8
 
 
 class PosedPicture(NamedTuple):
-    """A picture with its camera.
+    """A picture with its camera."""
 
-    Attributes:
-        name: Of the file.
-        file: The file.
-        mask_file: Its mask's; None if there is none.
-        camera: In W.
-        error: Root mean square reprojection error of its points [pixels].
-        n_points: Their number.
-    """
-
-    name: str
-    file: Path
-    mask_file: Path | None
-    camera: PosedCamera
-    error: float
-    n_points: int
+    name: str  # Of the file
+    file: Path  # The file
+    mask_file: Path | None  # Its mask's; None if there is none
+    camera: PosedCamera  # In W
+    error: float  # Root mean square reprojection error of its points [pixels]
+    n_points: int  # Their number
 
 
 class EstimatedPoses(NamedTuple):
-    """What structure from motion found.
+    """What structure from motion found."""
 
-    Attributes:
-        pictures: Those with a camera.
-        left_out: Name and reason of the others.
-        models: Number of pictures of each model that was found, largest first.
-        model: Which of them this is, from 0.
-        error: Root mean square reprojection error [pixels].
-        focal_error: Standard deviation of the focal length, as a share of it; 0 where it was given.
-        triangulation_angle: Largest angle between two rays to a point, median over points [rad].
-        n_points: Number of points in space.
-        features_on: Where points were looked for.
-        scale: Of the model, with its uncertainty.
-        up: Where up is, in W if it is known (0, 0, 1), with its uncertainty.
-        markers: Printed markers that were found, in units of the model.
-        warnings: What to know before using it.
-    """
-
-    pictures: tuple[PosedPicture, ...]
-    left_out: tuple[tuple[str, str], ...]
-    models: tuple[int, ...]
-    model: int
-    error: float
-    focal_error: float
-    triangulation_angle: float
-    n_points: int
-    features_on: str
-    scale: Scale
-    up: Up
-    markers: tuple[PlacedMarker, ...]
-    warnings: tuple[str, ...]
+    pictures: tuple[PosedPicture, ...]  # Those with a camera
+    left_out: tuple[tuple[str, str], ...]  # Name and reason of the others
+    models: tuple[int, ...]  # Number of pictures of each model that was found, largest first
+    model: int  # Which of them this is, from 0
+    error: float  # Root mean square reprojection error [pixels]
+    focal_error: float  # Standard deviation of the focal length, as a share of it; 0 where it was given
+    triangulation_angle: float  # Largest angle between two rays to a point, median over points [rad]
+    n_points: int  # Number of points in space
+    features_on: str  # Where points were looked for
+    scale: Scale  # Of the model, with its uncertainty
+    up: Up  # Where up is, in W if it is known (0, 0, 1), with its uncertainty
+    markers: tuple[PlacedMarker, ...]  # Printed markers that were found, in units of the model
+    warnings: tuple[str, ...]  # What to know before using it
 
 
 def estimate_poses(
@@ -148,7 +123,7 @@ def estimate_poses(
         images = checked_path("images", images)
     else:
         images = checked_items("images", images, Path)
-    told = (lambda _what, _share: None) if progress is None else progress
+    told = checked_progress(progress)
     # What is missing is said before work starts.
     colmap()
     opencv()

@@ -30,33 +30,20 @@ _SECTORS = 8
 
 
 class Scale(NamedTuple):
-    """How long a unit of a model is.
+    """How long a unit of a model is."""
 
-    Attributes:
-        metres: Metres per unit; None if it is not known.
-        error: Standard deviation, as a share of it; infinite if it is not known.
-        source: Where it comes from, in words.
-    """
-
-    metres: float | None
-    error: float
-    source: str
+    metres: float | None  # Metres per unit; None if it is not known
+    error: float  # Standard deviation, as a share of it; infinite if it is not known
+    source: str  # Where it comes from, in words
 
 
 class Up(NamedTuple):
-    """Where up is.
+    """Where up is."""
 
-    Attributes:
-        direction: Unit vector in the frame of the model; None if it is not known.
-        error: Standard deviation [rad]; infinite if it is not known.
-        source: Where it comes from, in words.
-        height: What the table's points have along it; None without a table.
-    """
-
-    direction: Float[np.ndarray, "3"] | None
-    error: float
-    source: str
-    height: float | None = None
+    direction: Float[np.ndarray, "3"] | None  # Unit vector in the frame of the model; None if it is not known
+    error: float  # Standard deviation [rad]; infinite if it is not known
+    source: str  # Where it comes from, in words
+    height: float | None = None  # What the table's points have along it; None without a table
 
 
 UNKNOWN_SCALE = Scale(None, math.inf, "not known: no marker and no known length")

@@ -28,27 +28,16 @@ _SQUARE = 0.5 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [
 
 
 class PlacedMarker(NamedTuple):
-    """A marker in the frame of the model.
+    """A marker in the frame of the model."""
 
-    Attributes:
-        number: Which one of its family.
-        views: Number of pictures that show it.
-        centre: Where it is.
-        axes: Rows: to the right, upwards on the sheet, out of the sheet, shape (3, 3).
-        side: Length of its sides, in units of the model.
-        side_error: Standard deviation of that, as a share of it.
-        axis_error: Standard deviation of the direction out of the sheet [rad].
-        residual: Root mean square of its corners' reprojection errors [pixels].
-    """
-
-    number: int
-    views: int
-    centre: Float[np.ndarray, "3"]
-    axes: Float[np.ndarray, "3 3"]
-    side: float
-    side_error: float
-    axis_error: float
-    residual: float
+    number: int  # Which one of its family
+    views: int  # Number of pictures that show it
+    centre: Float[np.ndarray, "3"]  # Where it is
+    axes: Float[np.ndarray, "3 3"]  # Rows: to the right, upwards on the sheet, out of the sheet, shape (3, 3)
+    side: float  # Length of its sides, in units of the model
+    side_error: float  # Standard deviation of that, as a share of it
+    axis_error: float  # Standard deviation of the direction out of the sheet [rad]
+    residual: float  # Root mean square of its corners' reprojection errors [pixels]
 
 
 def detect_markers(grey: UInt8[np.ndarray, "height width"], family: str) -> dict[int, np.ndarray]:

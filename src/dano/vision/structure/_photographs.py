@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy import ndimage
 
-from dano.checks import checked_count, checked_number, checked_path
+from dano.checks import checked_count, checked_number, checked_path, checked_progress
 from dano.extras import VIDEO_FILES
 from dano.progress import Progress
 from dano.vision.capture import picture_files as files_in, PICTURES, read_mask, read_picture
@@ -105,7 +105,7 @@ def write_frames(
     """
     video, folder = checked_path("video", video), checked_path("folder", folder)
     checked_count("count", count)
-    progress = progress or (lambda _what, _share: None)
+    progress = checked_progress(progress)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"frames must be a new or empty folder, got {folder}")
     if not video.is_file():

@@ -53,17 +53,12 @@ def fit_similarity(
 
 
 class PoseErrors(NamedTuple):
-    """By how much cameras differ from true ones, after the best motion.
+    """By how much cameras differ from true ones, after the best motion."""
 
-    Attributes:
-        position: Distance, as a share of each true camera's distance from the middle of what all look at.
-        angle: Angle between their orientations [rad].
-        scale: By what factor lengths are too large, minus 1.
-    """
-
+    # Distance, as a share of each true camera's distance from the middle of what all look at.
     position: Float[np.ndarray, " cameras"]
-    angle: Float[np.ndarray, " cameras"]
-    scale: float
+    angle: Float[np.ndarray, " cameras"]  # Angle between their orientations [rad]
+    scale: float  # By what factor lengths are too large, minus 1
 
 
 def pose_errors(
