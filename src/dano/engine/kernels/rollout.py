@@ -7,7 +7,7 @@ from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern, forget_blocks
 from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
-from dano.engine.kernels.sleep import fall_asleep, is_at_rest, sleeps, wake, wake_all
+from dano.engine.kernels.sleep import all_sleep, fall_asleep, is_at_rest, sleeps, wake, wake_all
 from dano.engine.kernels.solve import Options, solve, Solved
 from dano.engine.kernels.sweep import forget_candidates
 from dano.engine.kernels.tables import Push, Room, Scene, StateRow, StepReport
@@ -378,34 +378,39 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 begin_step_of_trees(scene, room, world, launch, t)
             wait()
             size = wp.max(size, room.trees.sizes[world, 0])
-        n_found, n_near, overflow = find_touching(scene, room, world, lane)
-        if lane == 0:
-            find_pattern(scene, room, world, n_near)
-        hits = any_hits(room, world, lane, n_found)
-        # A solve that cycles returns its best velocities: from there, with fitting duals, most converge.
-        attempt = int(0)
-        restarts = int(0)
-        again = bool(True)
+        n_found = int(0)
+        overflow = bool(False)
         solved = Solved()
+        solved.converged = True
         rebound = real(1.0)
-        while again:
-            rebound = ONE - real(attempt) / real(_REBOUNDS)
-            fix_laws(scene, room, world, lane, n_found, rebound, False)
-            wait()
-            solved = solve(scene, room, world, lane, n_found, size, launch.options)
-            again = False
-            if not solved.converged and restarts < _RESTARTS:
-                restarts += 1
-                again = True
-            elif hits and attempt < _REBOUNDS:
-                if adds_energy(scene, room, world):
-                    attempt += 1
+        # What sleeps on is near nothing that it was not near before.
+        if not all_sleep(scene, room, world):
+            n_found, n_near, overflow = find_touching(scene, room, world, lane)
+            if lane == 0:
+                find_pattern(scene, room, world, n_near)
+            hits = any_hits(room, world, lane, n_found)
+            # A solve that cycles returns its best velocities: from there, with fitting duals, most converge.
+            attempt = int(0)
+            restarts = int(0)
+            again = bool(True)
+            while again:
+                rebound = ONE - real(attempt) / real(_REBOUNDS)
+                fix_laws(scene, room, world, lane, n_found, rebound, False)
+                wait()
+                solved = solve(scene, room, world, lane, n_found, size, launch.options)
+                again = False
+                if not solved.converged and restarts < _RESTARTS:
+                    restarts += 1
                     again = True
-                    wait()
-                    if lane == 0:
-                        restart(scene, room, world)
-                    wait()
-        wait()
+                elif hits and attempt < _REBOUNDS:
+                    if adds_energy(scene, room, world):
+                        attempt += 1
+                        again = True
+                        wait()
+                        if lane == 0:
+                            restart(scene, room, world)
+                        wait()
+            wait()
         if lane == 0:
             report = StepReport()
             report.residual = solved.residual
