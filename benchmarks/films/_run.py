@@ -1,6 +1,7 @@
 """Poses of films against the truth: what all frames share and what each is off by, regions, and friction."""
 
 import argparse
+import json
 import sys
 import time
 import warnings
@@ -11,6 +12,7 @@ import numpy as np
 
 import dano
 from benchmarks._measure import load_average, parse_arguments, report, Row
+from benchmarks.figures import stored_row
 from benchmarks.films._films import filmed, KINDS, learned, PUSH
 from benchmarks.track._cases import in_region, read_case
 from benchmarks.track._phone import without_masks
@@ -21,6 +23,9 @@ from dano.vision import LearnedField, track, Tracked, TrackOptions
 
 _TRACKING = TrackOptions(table=0.0, views=48, turns=18, candidates=4, rays=1200)
 """For films of 280 × 210 pixels."""
+
+_ALL, _REGIONS, _OFF = "all films", "regions: all", "off by"
+"""Names of rows that others are made of."""
 
 _INTERVAL = 1.96
 """Standard errors of a 95 % interval."""
@@ -39,63 +44,86 @@ def run() -> None:
     """Measure, print and report."""
     arguments = parse_arguments("Track films whose truth is known.", _options)
     arguments.folder.mkdir(parents=True, exist_ok=True)
-    load, rows, held, judged = load_average(), [], [], []
-    names = arguments.only or [*KINDS, *_rendered(arguments.rendered)]
-    for name in names[: 1 if arguments.quick else None]:
-        made, inside, fit = _one(name, arguments)
-        rows += made
-        held += inside
-        judged += fit
-        for row in made:
+    load = load_average()
+    names = [*KINDS, *_rendered(arguments.rendered)] if arguments.only is None else arguments.only
+    names = names[: 1 if arguments.quick else None]
+    groups = [_group(name) for name in names]
+    rows = [row for row in _stored(arguments.json) if row.group not in [*groups, _ALL]]
+    for name, group in zip(names, groups, strict=True):
+        for row in _one(name, group, arguments):
             value = "" if row.value is None else f"{row.value:.3g} {row.unit}"
             print(f"{row.group}: {row.name} {value}  {row.note}", file=sys.stderr, flush=True)
-    if held:
-        share = 100 * float(np.mean(held))
-        rows.append(Row("all films", "regions: all", share, "%", 85.0, at_least=True, note="≤ 99"))
-    if judged:
-        note = f"of {len(judged)} slides"
-        rows.append(Row("all films", "intervals", sum(judged), "", 7, at_least=True, note=note))
+            rows.append(row)
+    rows += _together(rows)
     report("films", rows, {"quick": arguments.quick, "options": str(_TRACKING)}, load, arguments.json)
+
+
+def _stored(file: Path | None) -> list[Row]:
+    """Rows that an earlier run left in a file, to which this one adds."""
+    if file is None or not file.is_file():
+        return []
+    return [stored_row(row) for row in json.loads(file.read_text(encoding="utf-8"))["rows"]]
+
+
+def _together(rows: list[Row]) -> list[Row]:
+    """How many regions and intervals hold the truth, of all films."""
+    named = {(row.group, row.name): row.value or 0.0 for row in rows}
+    groups = [group for group, name in named if name == _REGIONS]
+    frames = np.array([named[group, "frames"] for group in groups])
+    held = np.array([named[group, _REGIONS] for group in groups])
+    off = [row for row in rows if row.name == _OFF]
+    share = float(np.average(held, weights=frames)) if frames.sum() else None
+    count = sum(row.verdict == "pass" for row in off)
+    return [
+        Row(_ALL, "regions that hold", share, "%", 85.0, at_least=True, note=f"of {frames.sum():.0f} frames"),
+        Row(_ALL, "intervals that hold", count, "", note=f"of {len(off)} slides"),
+    ]
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="DIR", help="where drawn films and objects are kept")
     parser.add_argument("--rendered", type=Path, metavar="DIR", help="what assets/render_videos.py wrote")
-    parser.add_argument("--only", nargs="+", metavar="FILM", help="some of the films")
+    parser.add_argument(
+        "--only", nargs="*", metavar="FILM", help="some of the films; of the others, rows of --json are kept"
+    )
 
 
 def _rendered(folder: Path | None) -> list[str]:
     return [] if folder is None else sorted(file.parent.name for file in folder.glob("*/truth.json"))
 
 
-def _one(name: str, arguments: argparse.Namespace) -> tuple[list[Row], list[bool], list[bool]]:
-    """Rows of a film; whether the region of each frame, and the interval of the friction, hold the truth."""
+def _group(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
+    """Rows of a film."""
     kind, folder = KINDS.get(name), arguments.folder
     if kind is None:
         case = read_case(arguments.rendered / name)
         film, camera, field, empty = without_masks(case.film), case.camera, case.field, case.background
         truth = _Truth(case.position, case.orientation, case.middle, case.size)
-        options, group = case.options("object"), name.replace("_", " ")
+        options = case.options("object")
     else:
         source = learned(folder, kind.toy, quick=arguments.quick)
         field, drawn = LearnedField.of_object(source), filmed(folder, name, quick=arguments.quick)
         film, camera, empty = drawn.film, drawn.camera, drawn.empty
         lower, upper = np.asarray(field.solid.solid_bounds, np.float64)
         truth = _Truth(drawn.position, drawn.orientation, 0.5 * (lower + upper), float((upper - lower).max()))
-        options, group = _TRACKING, name
+        options = _TRACKING
     began = time.process_time()
     found = track(film, field, camera, options, background=empty)
     seconds = (time.process_time() - began) / len(film.times)
-    rows, held = _of_poses(group, truth, found)
+    rows = _of_poses(group, truth, found)
     rows.append(Row(group, "CPU a frame", seconds, "s", note="with compilation and the start"))
     if kind is None or kind.friction is None:
-        return rows, held, []
+        return rows
     value, error = _friction(source, found)
     off = abs(value - kind.friction) / error
     rows.append(Row(group, "friction", value, "", note=f"± {error:.4f}, truth {kind.friction}"))
     rows += [Row(group, "error", error, ""), Row(group, "truth", kind.friction, "")]
-    rows.append(Row(group, "off by", off, "σ", _INTERVAL))
-    return rows, held, [bool(off < _INTERVAL)]
+    rows.append(Row(group, _OFF, off, "σ", _INTERVAL))
+    return rows
 
 
 def _friction(source: Path, found: Tracked) -> tuple[float, float]:
@@ -114,13 +142,13 @@ def _friction(source: Path, found: Tracked) -> tuple[float, float]:
     return float(fit.values["mu"]), max(1.0, float(fit.errors.rms)) * float(fit.standard_errors["mu"])
 
 
-def _of_poses(group: str, truth: _Truth, found: Tracked) -> tuple[list[Row], list[bool]]:
+def _of_poses(group: str, truth: _Truth, found: Tracked) -> list[Row]:
     """Errors of the middle and of the turn, with and without what all frames share."""
     ok = np.isfinite(found.position[:, 0])
     n, known = len(ok), int(ok.sum())
     frames = Row(group, "frames", known, "", note=f"of {n}: {', '.join(sorted(set(found.status)))}")
     if not known:
-        return [frames], []
+        return [frames]
     position, orientation = found.position[ok], found.orientation[ok]
     turns = quat_log(quat_multiply(quat_conjugate(orientation), truth.orientation[ok]))
     rotation, arm = quat_to_matrix(orientation), np.broadcast_to(truth.middle, position.shape)
@@ -142,7 +170,7 @@ def _of_poses(group: str, truth: _Truth, found: Tracked) -> tuple[list[Row], lis
     def angle(vectors: np.ndarray) -> float:
         return float(np.degrees(np.median(np.linalg.norm(vectors, axis=-1))))
 
-    rows = [
+    return [
         frames,
         Row(group, "position, median", float(np.median(away)), "%"),
         Row(group, "position, largest", float(away.max()), "%"),
@@ -152,9 +180,8 @@ def _of_poses(group: str, truth: _Truth, found: Tracked) -> tuple[list[Row], lis
         Row(group, "own", float(np.median(rest)), "%"),
         Row(group, "own turn", angle(left[:, 3:]), "°"),
         Row(group, "regions: own", 100 * float(alone.mean()), "%"),
-        Row(group, "regions: all", 100 * float(whole.mean()), "%"),
+        Row(group, _REGIONS, 100 * float(whole.mean()), "%"),
     ]
-    return rows, list(whole)
 
 
 def _squares(errors: np.ndarray, covariance: np.ndarray) -> np.ndarray:
