@@ -320,7 +320,7 @@ class Room:
         sorted: Bodies along an axis.
         marked: A bit for each pair that is a candidate.
         candidates: Pairs that may be near.
-        partners: The body that a body touches, see `dano.engine.kernels.search`.
+        partners: The body that a body has an impact with, see `dano.engine.kernels.impacts`.
         found: Pairs that are near, then those whose patches touch, shape (worlds, pairs · lanes).
         where: Of each point where it was found, shape (worlds, capacity).
         points: The points.
