@@ -98,7 +98,7 @@ def _group(name: str) -> str:
 
 def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
     """Rows of a film."""
-    kind, folder = KINDS.get(name), arguments.folder
+    kind, folder, source = KINDS.get(name), arguments.folder, None
     if kind is None:
         case = read_case(arguments.rendered / name)
         film, camera, field, empty = without_masks(case.film), case.camera, case.field, case.background
@@ -116,7 +116,7 @@ def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
     seconds = (time.process_time() - began) / len(film.times)
     rows = _of_poses(group, truth, found)
     rows.append(Row(group, "CPU a frame", seconds, "s", note="with compilation and the start"))
-    if kind is None or kind.friction is None:
+    if kind is None or kind.friction is None or source is None:
         return rows
     value, error = _friction(source, found)
     off = abs(value - kind.friction) / error

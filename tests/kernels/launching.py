@@ -67,7 +67,7 @@ class Arguments:
         }
         for place, rows in filled.items():
             self.put(place, rows)
-        of_moving = "momentum inertia meetings velocity tried best step residual scale moved".split()
+        of_moving = "momentum inertia meetings velocity tried best step residual scale".split()
         of_rows = (
             "order counts neighbours degrees islands members of_islands begins ends rests asleep".split()
         )

@@ -519,7 +519,7 @@ class Shown(NamedTuple):
 
     def light(self, towards: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "n 3 k"]:
         """Linear light that pixels get from far lamps of power one in some unit directions [W]."""
-        lamp, towards = Light((0.0, 0.0, 1.0)), towards.astype(np.float32)
+        lamp, towards = Light((0.0, 0.0, 1.0)), jnp.asarray(towards, jnp.float32)
         rows = []
         for looking, places, n in self.parts:
             rows.append(np.asarray(_lit(looking, places, lamp, towards), np.float64)[:, :n])
