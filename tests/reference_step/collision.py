@@ -1,6 +1,5 @@
 """Finding contact: docs/theory/contact.md, "Which side is sampled" and from "Finding contact" on."""
 
-from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +48,7 @@ class Points(NamedTuple):
         drift: ½ ω⁻ × (r₁ − r₀), its tangential part limited [m/s], shape (n, 3).
         impact: κ w [Pa s/m], zero where there is no impact, shape (n,).
         kappa: κ [Pa s/m].
+        nearing: How fast samples that have sunk in or nearly have approach, in the mean [m/s].
         sunk: Depth where geometry is taken [m], shape (n,).
         delta: Depth of the impact [m].
         deepest: Depth that another part of the body may have, whose impact is left to the next step [m].
@@ -58,6 +58,7 @@ class Points(NamedTuple):
         part: Share of an impact that the side carries.
         left_out: Share of a sample that rests which has no part in an impact.
         waits: Whether impulses on the first and on the second body take effect when the bodies meet.
+        holds: Whether the bodies lie on each other there while they wait for an impact.
         seen: The bodies with what their velocities gain until then.
     """
 
@@ -80,6 +81,7 @@ class Points(NamedTuple):
     drift: np.ndarray
     impact: np.ndarray
     kappa: float
+    nearing: float
     sunk: np.ndarray
     delta: float
     deepest: float
@@ -89,6 +91,7 @@ class Points(NamedTuple):
     part: float
     left_out: float
     waits: tuple[bool, bool] = (False, False)
+    holds: bool = False
     seen: Bodies | None = None
 
 
@@ -250,12 +253,12 @@ def meetings(scene, bodies, side):
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
-    raw, bodies = bodies, bodies.falling()
-    since = -1.0 if is_alone(scene, bodies, side) else 0.0
+    raw, bodies = bodies, bodies.falling(held_of(scene, bodies, side))
+    since = 0.0 if scene.joints else -1.0
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
     falls = nears(scene, bodies, side, delta, slow)
     support, left_out = np.zeros(6), 0.0
-    if since and share < 1 and falls:
+    if is_alone(scene, bodies, side) and share < 1 and falls:
         rest = rest_of(scene, raw, side, delta)
         if rest is not None:
             near, depth, arm, normal = rest
@@ -372,6 +375,14 @@ def is_alone(scene, bodies, side):
     return not scene.joints and not (bodies.moves[side.i] and bodies.moves[side.j])
 
 
+def held_of(scene, bodies, side):
+    """Which bodies others hold, shape (n,): of two that move those that hardly do."""
+    held = np.zeros(len(bodies.mass), bool)
+    if not scene.joints and not is_alone(scene, bodies, side):
+        held[[side.i, side.j]] = bodies.slow()[[side.i, side.j]]
+    return held
+
+
 def nears(scene, bodies, side, limit, slow):
     """Whether a sample that may get as deep as a limit [m] goes in faster than `slow` [m/s]."""
     if nearing(scene, bodies, side) <= slow:
@@ -472,7 +483,8 @@ def find(scene, bodies, shares=None):
         given = shares.get((side.i, side.j))
         met = hitting if listed(scene, bodies, side, hitting).beta > 0 else lasting
         found.append(listed(scene, bodies, side, met if given is None else met._replace(share=given)))
-    return together(bodies, halved([points for points in found if len(points.area)]))
+    found = halved([points for points in found if len(points.area)], bodies)
+    return together(bodies, [points for points in found if len(points.area)])
 
 
 def rounded(pair, normal):
@@ -490,10 +502,13 @@ def unit_rows(vectors):
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+OF_POINTS = ("arm", "normal", "moment", "depth", "rate", "meets", "area", "drift", "impact", "sunk")
+
+
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
     start = bodies
-    bodies = bodies.falling() if met.falls else bodies.held()
+    bodies = bodies.falling(held_of(scene, bodies, side)) if met.falls else bodies.held()
     if met.falls:
         bodies = bodies.supported(on_bodies(bodies, side.i, side.j, met.support))
     i, j, h, share = side.i, side.j, bodies.h, met.share
@@ -536,9 +551,8 @@ def listed(scene, bodies, side, met):
     beta, stiffness = 0.0, 0.0
     if not met.lasts:
         beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
-    alone = is_alone(scene, bodies, side) and met.hits
-    delays, turns = beta * alone, (np.zeros((3, 3)), np.zeros(3))
-    if delays > 0:
+    delays, turns = beta * (met.hits and not scene.joints), (np.zeros((3, 3)), np.zeros(3))
+    if delays > 0 and is_alone(scene, bodies, side):
         load = area * weight / (area * weight).sum()
         turns = turns_after(scene, bodies, side, share, load @ arm, load @ normal)
     return Points(
@@ -561,6 +575,7 @@ def listed(scene, bodies, side, met):
         drift=drift[kept],
         impact=(stiffness * met.hits * weight)[kept],
         kappa=stiffness * met.hits,
+        nearing=-float(near_load @ approach) / max(near_load.sum(), 1e-300),
         sunk=np.where(other, 0, before)[kept],
         delta=delta,
         deepest=deepest,
@@ -628,30 +643,97 @@ def impact(bodies, side, arm, normal, load, near_load, approach):
     return beta, factor / (bodies.h * mobility * load.sum())
 
 
-def halved(found):
-    """Sides whose impacts both bodies' samples have part in, with half of it each."""
-    hits = {(points.first, points.second) for points in found if np.any(points.impact > 0)}
+def halved(found, bodies):
+    """Sides of pairs as they take part in one impact, with half of it each if both do."""
+    by_pair = {points[:2]: points for points in found}
+    agreed = {}
+    for pair, points in by_pair.items():
+        other = by_pair.get(pair[::-1])
+        if other is not None and all(bodies.moves[list(pair)]):
+            agreed[pair] = at_one_moment(points, other, bodies)
+    found = [agreed.get(points[:2], points) for points in found]
+    hits = {points[:2] for points in found if np.any(points.impact > 0)}
     return [
         points._replace(impact=points.impact / 2, kappa=points.kappa / 2, part=0.5)
-        if (points.second, points.first) in hits
+        if points[:2] in hits and points[1::-1] in hits
         else points
         for points in found
     ]
 
 
+def at_one_moment(side, other, bodies):
+    """A side of a pair that moves, with impulses that take effect when those of the other one do.
+
+    The side that meets first says when. The other takes part if it has met by then, too, but for δ, or else
+    in the next step, unless the bodies rest on it: then impulses act from the start of the step.
+    """
+    if not (side.kappa > 0 and other.kappa > 0):
+        return side
+    earlier, later = sorted((side, other), key=lambda points: (points.share, points[:2]))
+    until = max(earlier.delays * earlier.share, 0)
+    delays = until / side.share if until else 0.0
+    if (later.share - earlier.share) * bodies.h * later.nearing > later.delta:
+        if np.any(later.depth > 0):
+            delays = 0.0
+        elif side is later:
+            none = {name: getattr(side, name)[:0] for name in OF_POINTS}
+            return side._replace(kappa=0.0, delays=0.0, **none)
+        else:
+            return side
+    return side._replace(delays=delays, way=(1 - delays) * max(side.share, 0.0))
+
+
 def together(bodies, found):
-    """Sides with impacts: impulses on bodies that move and touch no third one wait for it."""
-    pairs = {frozenset(points[:2]) for points in found}
-    touched = Counter(k for pair in pairs for k in pair)
-    wait = [bool(bodies.moves[k]) and touched[k] == 1 for k in range(len(bodies.mass))]
+    """Sides with impacts: impulses on bodies that have one with one other, and else only lie, wait."""
+    if not any(points.kappa > 0 for points in found):
+        return found
+    partners = [set() for _ in bodies.mass]
+    found = [points._replace(holds=holds(bodies, points)) for points in found]
+    for points in found:
+        if points.kappa > 0 or not is_quiet(bodies, points):
+            partners[points.first].add(points.second)
+            partners[points.second].add(points.first)
+    held = {k for points in found if points.holds for k in points[:2]}
 
     def waiting(points):
         if not points.delays:
             return points
-        i, j = points[:2]
-        if not wait[i] and not wait[j]:
+        carried = held if np.any(points.support) else set()
+        waits = tuple(
+            bool(bodies.moves[k]) and partners[k] == {other} and k not in carried
+            for k, other in (points[:2], points[1::-1])
+        )
+        if not any(waits):
             return points._replace(delays=0.0, way=max(points.share, 0.0))
-        x, other = (points.seen.pose(k, wait[k] * points.delays * points.share)[0] for k in (i, j))
-        return points._replace(waits=(wait[i], wait[j]), com_difference=x - other)
+        return points._replace(waits=waits)
 
-    return [waiting(points) for points in found]
+    found = [waiting(points) for points in found]
+    until = {k: when_met(found, k)[0] for points in found for k in points[:2]}
+
+    def apart(points):
+        x, other = (points.seen.pose(k, until[k])[0] for k in points[:2])
+        return points._replace(com_difference=x - other)
+
+    return [apart(points) for points in found]
+
+
+def is_quiet(bodies, points):
+    """Whether no part of a side gets in that nears the other body by more than it falls in half a step."""
+    slow = 0.5 * bodies.h * np.linalg.norm(bodies.gravity)
+    return not np.any((points.depth - bodies.h * points.rate > 0) & (points.rate < -slow))
+
+
+def holds(bodies, points):
+    """Whether a side holds its bodies while they wait for an impact: it touches, and has none."""
+    return points.kappa == 0 and bool(np.any(points.depth > 0)) and is_quiet(bodies, points)
+
+
+def when_met(found, k):
+    """Share of the step after which impulses on a body take effect, and β; the mean of several."""
+    waiting = [
+        (points.delays * points.share, points.delays)
+        for points in found
+        for i, waits in zip(points[:2], points.waits, strict=True)
+        if waits and i == k
+    ]
+    return np.mean(waiting, axis=0) if waiting else np.zeros(2)

@@ -7,7 +7,7 @@ coordinate. Poses are functions of what a step makes of them, x(q ⊕ h y); all 
 import jax
 import numpy as np
 from reference_step.bodies import read
-from reference_step.collision import on_bodies, unit
+from reference_step.collision import on_bodies, unit, when_met
 from reference_step.rotations import (
     conjugate,
     exponential,
@@ -46,6 +46,7 @@ class Kinematics:
         self.hangs = {self.names.index(joint.child): joint for joint in self.joints}
         moves = self.bodies.moves
         self.met, self.lead = np.zeros(len(self.names)), np.ones(len(self.names))
+        self.held, self.on_way = np.zeros(len(self.names)), np.zeros((len(self.names), 6))
         self.supports = np.zeros((len(self.names), 6))
         self.free = [i for i in range(len(self.names)) if moves[i] and i not in self.hangs]
         self.joint_rows, size = {}, 6 * len(self.free)
@@ -194,37 +195,60 @@ class Kinematics:
         return gained
 
     def balance_when_met(self, found):
-        """Take when bodies meet fixed ones, the mean of several moments, and what they rest on until then."""
+        """Take when bodies meet, and what they rest on until then."""
         for p in found:
-            until = p.part * p.delays * (0.5 + p.share)
-            self.supports += until * on_bodies(self.bodies, p.first, p.second, p.support)
+            if any(p.waits):
+                support = p.part * p.delays * on_bodies(self.bodies, p.first, p.second, p.support)
+                self.supports += (0.5 + p.share) * support
+                self.on_way += (0.5 + 0.5 * p.share) * support
+            if p.holds:
+                self.held[list(p[:2])] = True
         for i in self.free:
-            waiting = [
-                (p.delays * p.share, p.delays)
-                for p in found
-                for k, waits in zip(p[:2], p.waits, strict=True)
-                if waits and k == i
-            ]
-            if waiting:
-                self.met[i], self.lead[i] = np.mean(waiting, axis=0) * [1, -1] + [0, 1]
+            self.met[i], beta = when_met(found, i)
+            self.lead[i] = 1 - beta
+
+    def push(self, control):
+        """Take forces and torques of the step as part of what moves bodies until they meet."""
+        if control is not None:
+            self.on_way += self.h * np.c_[np.asarray(control.force), np.asarray(control.torque)]
+
+    def moved(self, y):
+        """y by which positions change: bodies go on as before until they meet."""
+        bodies, found = self.bodies, np.array(y)
+        for r, i in enumerate(self.free):
+            if self.lead[i] < 1:
+                falls, met = 1 - self.held[i], self.met[i]
+                before = np.r_[bodies.velocity[i] + falls * bodies.gain[i], bodies.spin[i]]
+                before[3:] += falls * (1 - self.lead[i]) * (0.5 + met) * bodies.spin_gain[i]
+                before[:3] += bodies.inverse_mass[i] * self.on_way[i, :3]
+                before[3:] += bodies.inverse_inertia[i] @ self.on_way[i, 3:]
+                rows = slice(6 * r, 6 * r + 6)
+                found[rows] = (1 - met) * y[rows] + met * before
+        return found
 
     def rotation_met(self, i):
         """Rotation of a body when its angular momentum is balanced."""
         q, ahead = self.bodies.orientation[i], self.bodies.ahead_falling[i]
         return matrix(unit(q + self.met[i] * (ahead - q)))
 
-    def inertia_met(self, i):
-        """Its inertia then [kg m², W]."""
-        R = self.rotation_met(i)
-        return R @ self.bodies.inertia[i] @ R.T
-
-    def end_of_impact(self, i, w):
-        """Spin at the end of the step [B] and what it turns by besides `w` [W]; w is that of the balance."""
+    def turn_in_impact(self, i, w):
+        """What a body turns by in the step besides the spin of the balance w [rad/s, W]."""
         R, J, h, met = self.rotation_met(i), self.bodies.inertia[i], self.h, self.met[i]
         seen = R.T @ w
-        omega = spin_with(momentum(seen, J, h, self.lead[i]), seen, J, h, 1 - 2 * met)
-        gains = R @ gyroscopic_gain(omega, J, h) - self.bodies.spin_gain[i]
-        return omega, R @ (omega - seen) + met**2 / 2 * gains
+        after = spin_with(momentum(seen, J, h, self.lead[i]), seen, J, h, 1 - 2 * met)
+        gains = R @ gyroscopic_gain(after, J, h) - self.bodies.spin_gain[i]
+        return R @ (after - seen) + met**2 / 2 * gains
+
+    def spin_after_impact(self, i, w, orientation):
+        """Spin at the end of the step [B], of a body whose balance gives w [rad/s, W]."""
+        R, J, h = self.rotation_met(i), self.bodies.inertia[i], self.h
+        L = R @ momentum(R.T @ w, J, h, self.lead[i])
+        return spin_with(matrix(orientation).T @ L, R.T @ w, J, h, -1)
+
+    def balanced(self, i, omega, orientation):
+        """The spin [W] of the balance that leads to a spin [B] and an orientation at the end of a step."""
+        R, R_met, J, h = matrix(orientation), self.rotation_met(i), self.bodies.inertia[i], self.h
+        return R_met @ spin_with(R_met.T @ R @ momentum(omega, J, h, -1), omega, J, h, self.lead[i])
 
     def gaps(self, y):
         """φ: how far loops are open after a step; distances [m, W], then turns of welds [rad]."""
@@ -249,15 +273,17 @@ class Kinematics:
         steps = (self.gaps(1j * SMALL * e).imag / (SMALL * self.h) for e in np.eye(k))
         return np.array(list(steps)).T.reshape(-1, k)
 
-    def end(self, y, moved):
-        """The state at the end of a step with y, and poses from `moved`, as arrays by name."""
-        twists, rows, moved = self.twists(y), slice(6 * len(self.free), None), np.array(moved)
+    def end(self, y):
+        """The state at the end of a step with y, as arrays by name."""
+        twists, rows, moved = self.twists(y), slice(6 * len(self.free), None), self.moved(y)
         omega = [matrix(q).T @ V[3:] for (_, q), V in zip(self.now, twists, strict=True)]
         for r, i in enumerate(self.free):
             if self.lead[i] < 1:
-                omega[i], turned = self.end_of_impact(i, twists[i][3:])
-                moved[6 * r + 3 : 6 * r + 6] += turned
+                moved[6 * r + 3 : 6 * r + 6] += self.turn_in_impact(i, twists[i][3:])
         poses = self.placed(moved)
+        for i in self.free:
+            if self.lead[i] < 1:
+                omega[i] = self.spin_after_impact(i, twists[i][3:], poses[i][1])
         q = (self.q + self.h * y)[rows]
         for joint in self.joints:
             if joint.kind == "ball":

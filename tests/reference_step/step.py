@@ -1,7 +1,7 @@
 """One step: docs/theory/integrator.md. Everything is a root R(y) = 0, searched with a plain Newton method."""
 
 import numpy as np
-from reference_step.collision import find, on_bodies
+from reference_step.collision import find
 from reference_step.joint_law import JointLaw
 from reference_step.kinematics import Kinematics
 from reference_step.law import relative, wrench
@@ -30,6 +30,7 @@ class Step:
         self.given = find(self.scene, self.kinematics.bodies, shares)
         self.points = list(self.given)
         self.kinematics.balance_when_met(self.given)
+        self.kinematics.push(control)
         self.patches = patches_of(self.scene, self.kinematics.bodies)
         self.loops = self.kinematics.gap_slopes()
         self.start = np.r_[self.kinematics.start, np.zeros(len(self.loops))]
@@ -85,24 +86,6 @@ class Step:
         for n, points in enumerate(self.given):
             if not points.law.compliant:
                 self.points[n] = points._replace(law=points.law._replace(e=share * points.law.e))
-
-    def moved(self, y):
-        """y by which positions change: impulses of impacts take effect after the share τ of the step."""
-        k, found = self.kinematics, np.array(y)
-        for points in self.points:
-            if points.delays:
-                done = wrench(points, k.seen(y))
-                rests = on_bodies(k.bodies, points.first, points.second, points.support)
-                rests *= 0.5 * points.share**2 * points.part
-                for i, impulse, waits in zip(
-                    points[:2], (done.first, done.second), points.waits, strict=True
-                ):
-                    if waits:
-                        at = 6 * k.free.index(i)
-                        late = points.delays * (points.share * k.h * impulse + rests[i])
-                        found[at : at + 3] -= k.bodies.inverse_mass[i] * late[:3]
-                        found[at + 3 : at + 6] -= np.linalg.solve(k.inertia_met(i), late[3:])
-        return found
 
     def adds_energy(self, y):
         """Whether contact adds more than a thousandth of the energy that it moves between coordinates."""
@@ -184,7 +167,7 @@ def step(scene, state, control=None, shares=None):
     """
     equations = Step(scene, state, control, shares)
     y = settled(equations)
-    return equations.kinematics.end(y, equations.moved(y)), equations
+    return equations.kinematics.end(y), equations
 
 
 def settled(equations):

@@ -49,6 +49,7 @@ def random_points(law, impact):
         drift=drift,
         impact=impact * np.where(x < 1, np.maximum(x, 0) ** 2, 2 * x - 1) * counts,
         kappa=impact,
+        nearing=0.0,
         sunk=law.delta * x,
         delta=law.delta,
         deepest=5 * law.delta,

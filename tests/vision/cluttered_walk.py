@@ -11,12 +11,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
-from vision.tabletop import camera, pattern
+from vision.tabletop import camera
 
+from benchmarks.films._paper import linear, newspaper, PAPER, pattern, SIDE, TEXELS, written
 from dano.vision import Capture, NodeGrid, PosedCamera, View
-
-PAPER = np.array([0.84, 0.81, 0.75])
-"""Colour of the paper and of the pale patches, sRGB."""
 
 SUN = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])
 SKY, NOISE = 0.45, 0.008
@@ -27,7 +25,6 @@ _RING, _WIRE, _AT = 0.017, 0.0055, np.array([-0.012, 0.0, 0.036])
 """The handle: a ring that stands on the block, whose hole is seen through."""
 
 _LOW, _HIGH = np.array([-0.047, -0.029, 0.0]), np.array([0.047, 0.029, 0.06])
-_TEXELS, _SIDE = 2048, 0.8
 RAYS = 2
 """Rays of a pixel, along each side."""
 
@@ -46,52 +43,6 @@ def solid(nodes: int = 160) -> tuple[NodeGrid, np.ndarray]:
     """A fine grid around the toy, and its signed distance there."""
     box = NodeGrid.around(_LOW - 0.004, _HIGH + 0.004, nodes)
     return box, distance(box.nodes).reshape(box.shape)
-
-
-@cache
-def newspaper(seed: int = 0) -> np.ndarray:
-    """A double page from above, sRGB, its middle at the origin."""
-    rng = np.random.default_rng(seed)
-    page = np.broadcast_to(PAPER, (_TEXELS, _TEXELS, 3)).copy()
-    photograph = np.stack([pattern(seed + k, _TEXELS) for k in range(3)], axis=-1)
-    width, line = 180, 8
-    for left in range(12, _TEXELS - width, width + 16):
-        row = int(rng.integers(0, 80))
-        while row < _TEXELS - 220:
-            kind = rng.random()
-            if kind < 0.12:
-                size = int(rng.integers(80, 200))
-                tint = 0.6 + 0.4 * rng.random(3)
-                page[row : row + size, left : left + width] = (
-                    0.9 * tint * photograph[row : row + size, left : left + width]
-                )
-                row += size + 14
-            elif kind < 0.25:
-                _words(page, rng, row, left, width, 22)
-                row += 36
-            elif kind < 0.32:
-                row += int(rng.integers(30, 90))  # Pale.
-            else:
-                for _ in range(int(rng.integers(6, 24))):
-                    _words(page, rng, row, left, width, 4)
-                    row += line
-                row += 8
-    return page
-
-
-def _words(page: np.ndarray, rng: np.random.Generator, row: int, left: int, width: int, tall: int) -> None:
-    """A line of words: dark bars of letters."""
-    x = left
-    while x < left + width - 8:
-        letters = int(rng.integers(2, 9))
-        for _ in range(letters):
-            broad = max(2, tall // 2 + int(rng.integers(-1, 2)))
-            if x + broad > left + width:
-                break
-            high = tall - int(rng.integers(0, max(tall // 3, 1) + 1))
-            page[row + tall - high : row + tall, x : x + broad - 1] = 0.16 + 0.08 * rng.random()
-            x += broad
-        x += max(3, tall // 2)
 
 
 def skin(points: np.ndarray, pale: float) -> np.ndarray:
@@ -120,12 +71,12 @@ def photograph(
     ray = seen.directions(np.stack([x.ravel(), y.ravel()], axis=1))
     eye = seen.position
     paper = eye - eye[2] / np.minimum(ray[:, 2:], -1e-6) * ray
-    scale = _TEXELS / _SIDE
-    place = [_TEXELS / 2 - 0.5 - paper[:, 1] * scale, _TEXELS / 2 - 0.5 + paper[:, 0] * scale]
+    scale = TEXELS / SIDE
+    place = [TEXELS / 2 - 0.5 - paper[:, 1] * scale, TEXELS / 2 - 0.5 + paper[:, 0] * scale]
     place = [np.clip(a, -1e5, 1e5) for a in place]
     printed = newspaper(page)
     light = np.stack([map_coordinates(printed[..., c], place, order=1, mode="mirror") for c in range(3)], 1)
-    light = _linear(light) * (SKY + (1 - SKY) * SUN[2])
+    light = linear(light) * (SKY + (1 - SKY) * SUN[2])
     hit = np.zeros(len(ray), bool)
     if toy:
         near = np.flatnonzero(np.abs(paper[:, :2]).max(axis=1) < 0.25)
@@ -139,21 +90,12 @@ def photograph(
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         lit = ~_meets(point + 4e-4 * normal, np.broadcast_to(SUN, point.shape))[0]
         strength = SKY * (0.75 + 0.25 * normal[:, 2]) + (1 - SKY) * lit * np.maximum(normal @ SUN, 0)
-        light[hit] = _linear(skin(point, pale)) * strength[:, None]
+        light[hit] = linear(skin(point, pale)) * strength[:, None]
 
     def averaged(values: np.ndarray) -> np.ndarray:
         return values.reshape(seen.height, RAYS, seen.width, RAYS, -1).mean((1, 3))
 
-    return _written(averaged(light)), averaged(hit * 1.0)[..., 0]
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    return np.where(srgb < 0.04045, srgb / 12.92, ((np.maximum(srgb, 0) + 0.055) / 1.055) ** 2.4)
-
-
-def _written(light: np.ndarray) -> np.ndarray:
-    light = np.clip(light, 0, 1)
-    return np.where(light < 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return written(averaged(light)), averaged(hit * 1.0)[..., 0]
 
 
 def _meets(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

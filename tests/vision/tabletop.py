@@ -7,6 +7,7 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
+from benchmarks.films._paper import pattern as pattern
 from dano.vision import PosedCamera
 
 TAG, TAG_SIDE, TAG_CENTRE = 3, 0.05, np.array([0.09, -0.04, 0.0])  # [m]
@@ -14,16 +15,6 @@ BALL, RADIUS = np.array([0.0, 0.02, 0.04]), 0.04  # [m]
 FOCAL, WIDTH, HEIGHT = 250.0, 240, 180  # [pixels]
 _METRE = 1600
 """Texels a metre."""
-
-
-def pattern(seed: int, side: int = 1024) -> np.ndarray:
-    """Grey values with detail at every size, 0 to 1."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros((side, side), np.float32)
-    for cells, strength in ((16, 0.5), (48, 0.6), (140, 0.7), (400, 0.5)):
-        noise = rng.normal(size=(cells, cells)).astype(np.float32)
-        total += strength * cv2.resize(noise, (side, side), interpolation=cv2.INTER_CUBIC)
-    return np.clip(0.5 + 0.16 * total, 0, 1)
 
 
 def table(seed: int = 0, *, tag: bool = True) -> np.ndarray:

@@ -13,8 +13,10 @@ from dano.cli import main
 from dano.identification import load_motion
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
 from dano.vision import adjust_poses, Light, track, TrackOptions
+from dano.vision.drawing import GAMMA
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import moved_edge, overlap
+from dano.vision.tracking._subject import Subject
 from dano.vision.tracking._walk import Walk
 
 
@@ -121,6 +123,39 @@ def test_frames_in_which_it_lies_still_share_one_pose(bunny, camera, filmed):
 
 def turn_of(p, q):
     return quat_log(quat_multiply(quat_conjugate(p), q))
+
+
+def test_what_the_edge_of_the_picture_cuts_is_fitted_by_what_is_seen(bunny, camera):
+    """No frame shows all of it; what lies beside the picture is unknown, and too little is no pose."""
+    orientation = np.tile(path(1)[1], (3, 1))
+    position = np.array([[0.09, 0.0, 0.0], [0.112, 0.0, 0.0], [0.134, 0.0, 0.0]])
+    places = [Placement(p, q) for p, q in zip(position, orientation, strict=True)]
+    shares = [Subject(bunny).inside(place, camera) for place in places]
+    assert shares[0] < 0.9 and shares[1] > 0.55 and shares[2] < 0.35
+    frames, masks = zip(
+        *(drawn(bunny, camera, p, q) for p, q in zip(position, orientation, strict=True)), strict=True
+    )
+    options = TrackOptions(rays=700, views=48, turns=16, candidates=3)
+    found = track(film_of(frames, masks), bunny, camera, options)
+    assert found.status == ("tracked", "tracked", "outside")
+    assert np.isnan(found.position[2]).all()
+    assert any("its pose is doubtful, in 1 frames: 2" in text for text in found.messages)
+    shift, turn = errors(found, position, orientation, slice(0, 2))
+    assert (shift.max() < 0.03, np.degrees(turn.max()) < 3) == (True, True), (shift, turn)
+
+
+def test_light_of_many_lamps_is_that_of_each(bunny, camera):
+    """Beside the renderer, lamp by lamp."""
+    subject, (position, orientation) = Subject(bunny), path(1)
+    place = Placement(position[0], orientation[0])
+    pixels = np.stack(np.meshgrid(np.arange(30, 66), np.arange(20, 52)), axis=-1).reshape(-1, 2) + 0.5
+    towards = np.array([[0.6, 0.0, 0.8], [-0.48, -0.6, 0.64], [0.0, 1.0, 0.0]])
+    light = subject.shown(place, camera, pixels).light(towards)
+    for k, direction in enumerate(towards):
+        seen = subject.picture(place, (Light(direction),), camera, pixels)
+        each = np.maximum(seen.colour / np.maximum(seen.opacity, 0.5)[:, None], 0) ** GAMMA
+        np.testing.assert_allclose(light[..., k], each, atol=1e-5)
+    assert light.max() > 0.1
 
 
 def test_the_start_is_found_among_all_orientations(bunny, camera, filmed):

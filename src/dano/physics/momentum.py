@@ -9,8 +9,8 @@ import math
 
 import warp as wp
 
-from dano.physics.real import HALF, mat33, ONE, real, TWO, vec3, ZERO
-from dano.physics.rotations import RESOLVED, skew
+from dano.physics.real import HALF, mat33, ONE, quat, real, TWO, vec3, ZERO
+from dano.physics.rotations import matrix, RESOLVED, skew, turned
 
 FADE = 0.15
 """Over how much of x the momentum of fast spins tends to Jω: a tenth of a turn."""
@@ -104,21 +104,20 @@ def gyroscopic_gain(omega: vec3, inertia: mat33, inverse: mat33, h: real) -> vec
 
 
 @wp.func
-def spin_seen_from(omega: vec3, inertia: mat33, h: real, lead: real, other: real) -> vec3:
-    """The spin with the same angular momentum, as seen with another lead; by Newton's method.
+def spin_with(momentum: vec3, start: vec3, inertia: mat33, h: real, lead: real) -> vec3:
+    """The spin with an angular momentum, by Newton's method [rad/s, B].
 
     Args:
-        omega: The spin [rad/s, B].
+        momentum: The angular momentum [kg m²/s, B].
+        start: A spin near it [rad/s, B].
         inertia: [kg m², B].
         h: Timestep [s].
         lead: See `angular_momentum`.
-        other: The other lead.
     """
-    momentum = angular_momentum(omega, inertia, h, lead)
-    found = omega
+    found = start
     for _k in range(_SEEN):
-        missed = angular_momentum(found, inertia, h, other) - momentum
-        found = found - wp.inverse(angular_momentum_jacobian(found, inertia, h, other)) * missed
+        missed = angular_momentum(found, inertia, h, lead) - momentum
+        found = found - wp.inverse(angular_momentum_jacobian(found, inertia, h, lead)) * missed
     return found
 
 
@@ -127,12 +126,20 @@ class EndOfImpact:
     """What becomes of a body whose spin was solved for when it met another."""
 
     omega: vec3  # Its spin at the end of the step [rad/s, B]
-    turn: vec3  # What is added to the spin by which its orientation changes within the step [rad/s, W]
+    orientation: quat  # Its orientation then
 
 
 @wp.func
 def end_of_impact(
-    spin: vec3, inertia: mat33, rotation: mat33, gain: vec3, h: real, met: real, lead: real
+    spin: vec3,
+    inertia: mat33,
+    rotation: mat33,
+    orientation: quat,
+    moved: vec3,
+    gain: vec3,
+    h: real,
+    met: real,
+    lead: real,
 ) -> EndOfImpact:
     """The end of a step in which angular momentum is balanced after the share τ.
 
@@ -140,23 +147,29 @@ def end_of_impact(
 
         τ (ω + (½ + τ/2) γ) + (1 − τ) (ω_τ + (1 − τ)/2 γ⁺),
 
-    of which the impulse tells τ (ω + (½ + τ) γ) + (1 − τ) ω_τ.
+    of which the impulse tells τ (ω + (½ + τ) γ) + (1 − τ) ω_τ. The spin at the end is the one with the
+    angular momentum of the balance, as seen from the orientation to which this mean leads.
 
     Args:
         spin: The spin that the balance gives [rad/s, W].
         inertia: [kg m², B].
         rotation: Of the body when it is balanced.
+        orientation: Of the body when the step begins.
+        moved: What the impulse tells of the spin by which it turns [rad/s, W].
         gain: γ [rad/s, W].
         h: Timestep [s].
         met: τ.
         lead: With which the balance sees the spin.
     """
     end = EndOfImpact()
-    back = wp.transpose(rotation)
-    seen = back * spin
-    end.omega = spin_seen_from(seen, inertia, h, lead, ONE - TWO * met)
-    gains = rotation * gyroscopic_gain(end.omega, inertia, wp.inverse(inertia), h)
-    end.turn = rotation * (end.omega - seen) + (HALF * met * met) * (gains - gain)
+    seen = wp.transpose(rotation) * spin
+    momentum = angular_momentum(seen, inertia, h, lead)
+    after = spin_with(momentum, seen, inertia, h, ONE - TWO * met)
+    gains = rotation * gyroscopic_gain(after, inertia, wp.inverse(inertia), h)
+    turn = moved + rotation * (after - seen) + (HALF * met * met) * (gains - gain)
+    end.orientation = turned(orientation, wp.transpose(matrix(orientation)) * turn, h)
+    momentum = wp.transpose(matrix(end.orientation)) * (rotation * momentum)
+    end.omega = spin_with(momentum, after, inertia, h, -ONE)
     return end
 
 

@@ -6,10 +6,11 @@ Geometry is taken where the old velocities take the bodies by a share τ of the 
 import warp as wp
 
 from dano.physics.features import TREES
-from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, ZERO
+from dano.physics.real import HALF, mat33, ONE, quat, real, vec3, vec6, ZERO
 from dano.physics.rotations import direction, interpolated, matrix, rotation_from_z
 from dano.physics.solids.distances import Solid, solid_distance
 from dano.physics.solids.leaves import Distance, Solids
+from dano.physics.twists import angular_part, joined, linear_part
 
 FIXED, AXIS, BALL = 0, 1, 2
 """How samples turn with their body: with it; about its z axis they keep facing the other body; altogether."""
@@ -46,12 +47,15 @@ class BodyState:
     com: vec3  # Centre of mass in the field frame [m, F]
     inverse_mass: real  # Effective inverse mass [1/kg], zero for a fixed body
     inverse_inertia: mat33  # Effective inverse inertia [1/(kg m²), W], zero for a fixed body
-    # Share of the step after which the body meets a fixed one in an impact; 0 where it does not. Its angular
-    # momentum is balanced then.
+    # Share of the step after which the body meets another one in an impact, and impulses on it take effect; 0
+    # where they act from the start. Its angular momentum is balanced then.
     met: real
     # With which the balance sees the spin, see `angular_momentum`: 1 for that of the step, 0 for that at the
     # moment of the balance, in an impact.
     lead: real
+    held: real  # 1 where others hold the body until then, 0 where it falls
+    # Impulse on the body within the step besides gravity, as its way until then feels it [N s, N m s, W].
+    support: vec6
 
 
 @wp.struct
@@ -186,11 +190,37 @@ def position_after(body: BodyState, share: real, h: real) -> vec3:
 
 
 @wp.func
-def centres_apart(
-    first: BodyState, second: BodyState, first_until: real, second_until: real, h: real
-) -> vec3:
-    """From the second body's centre of mass to the first's, each after a share of the step [m, W]."""
-    return position_after(first, first_until, h) - position_after(second, second_until, h)
+def centres_apart(first: BodyState, second: BodyState, h: real) -> vec3:
+    """From the second body's centre of mass to the first's, each where impulses on it take effect [m, W]."""
+    return position_after(first, first.met, h) - position_after(second, second.met, h)
+
+
+@wp.func
+def moved_in_impact(body: BodyState, velocity: vec6) -> vec6:
+    """Velocity and spin by which a body moves in a step with an impact after the share τ [W].
+
+    (1 − τ) V⁺ + τ (V⁻ + Δ), with what gravity, gyroscopic torque and supports add to V⁻: the parabola of free
+    fall until then, and from then on.
+
+    Args:
+        body: When the step begins.
+        velocity: V⁺ of the balance [W].
+    """
+    falls = ONE - body.held
+    v = body.velocity + falls * body.gain + body.inverse_mass * linear_part(body.support)
+    gains = falls * (ONE - body.lead) * (HALF + body.met)
+    spin = body.spin + gains * body.spin_gain + body.inverse_inertia * angular_part(body.support)
+    return (ONE - body.met) * velocity + body.met * joined(v, spin)
+
+
+@wp.func
+def is_held(body: BodyState) -> bool:
+    """Whether a body moves by less than it falls in half a step: then others hold it."""
+    if body.inverse_mass == ZERO:
+        return False
+    radius_squared = real(3.0) * body.inverse_mass / wp.trace(body.inverse_inertia)
+    squared = wp.length_sq(body.velocity) + radius_squared * wp.length_sq(body.spin)
+    return squared < real(0.25) * wp.length_sq(body.gain)
 
 
 @wp.func

@@ -1,54 +1,171 @@
 """Impulses of impacts: they take effect when bodies meet (docs/theory/contact.md, "Impacts").
 
 A step has one velocity at its end. Impulses of contact that lasts act from its start, so positions change by
-it. One of an impact that happens after the share τ of the step changes positions for the rest of it only: by
-τ M⁻¹ P less.
+it. Those on a body that has an impact after the share τ of the step change positions for the rest of it only.
 """
 
 import warp as wp
 
-from dano.engine.kernels.assembly import add_point_jacobian, Halves, point_impulse, presses, whole_jacobian
-from dano.engine.kernels.lanes import total6, total66, wait
-from dano.engine.kernels.tables import FoundPair, Room, Scene
+from dano.engine.kernels.lanes import total, wait
+from dano.engine.kernels.near import as_they_meet
+from dano.engine.kernels.tables import FoundPair, Room, Scene, StateRow
 from dano.physics.features import LANES, TREES
-from dano.physics.momentum import turned_inertia
-from dano.physics.pairs import FIXED, rotation_met
-from dano.physics.real import HALF, mat66, ONE, vec3, vec6, ZERO
-from dano.physics.twists import angular_part, joined, linear_part, wrench_at
+from dano.physics.impacts import delayed, no_impact
+from dano.physics.momentum import end_of_impact, turned_inertia
+from dano.physics.pairs import BodyState, centres_apart, moved_in_impact, rotation_met
+from dano.physics.real import HALF, mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
+from dano.physics.twists import angular_part, linear_part, wrench_at
 
-_LANES, _FIXED = wp.constant(LANES), wp.constant(FIXED)
+_LANES = wp.constant(LANES)
+# With whom a body has an impact, if not with one other.
+_NOBODY, _SEVERAL = wp.constant(-1), wp.constant(-2)
 
 
 @wp.func
-def pair_impulse(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> vec6:
-    """Impulse of a pair at the first body's centre of mass, as it was linearised last [N s, N m s, W]."""
-    h = scene.timestep[world, 0]
-    wrench = vec6()
+def touches(room: wp.ref[Room], world: int, found: FoundPair) -> bool:
+    """Whether a pair touches when the step begins."""
+    deepest = real(0.0)
     for k in range(found.first, found.end):
-        if presses(room, world, k):
-            point = room.points[world, k]
-            wrench += point_impulse(point, room.linear[world, k], h * point.area)
-    return total6(wrench)
+        deepest = wp.max(deepest, room.points[world, k].depth)
+    return total(deepest) > ZERO
 
 
 @wp.func
-def pair_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> mat66:
-    """Its derivative by the twist of the first body relative to the second."""
+def is_quiet(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> bool:
+    """Whether no part of a pair gets in that nears the other body by more than it falls in half a step."""
     h = scene.timestep[world, 0]
-    halves = Halves()
-    rolls = scene.body_index[scene.pair_index[found.pair].first].turning != _FIXED
+    slow = HALF * h * wp.length(scene.gravity[world, 0])
+    nearing = real(0.0)
     for k in range(found.first, found.end):
-        if presses(room, world, k):
-            linear = room.linear[world, k]
-            point = room.points[world, k]
-            add_point_jacobian(halves, point, linear, h * point.area, rolls)
-    return total66(whole_jacobian(halves))
+        point = room.points[world, k]
+        if point.depth - h * point.rate > ZERO and point.rate < -slow:
+            nearing = ONE
+    return total(nearing) == ZERO
 
 
 @wp.func
-def meetings_of(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int) -> vec3:
-    """How many impulses on a body wait for when it meets another, by how much, and the sum of moments τ_β."""
-    return room.meetings[world, scene.body_index[body].row]
+def leave_to_next(room: wp.ref[Room], world: int, k: int, h: real):
+    """Leave a side of a pair to the next step."""
+    found = room.found[world, k]
+    found.end = found.first
+    found.impact = no_impact(found.impact.depth, found.impact.factor, found.impact.deepest, h)
+    room.found[world, k] = found
+
+
+@wp.func
+def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h: real):
+    """Have both sides of a pair that have an impact meet at one moment: else its momentum would change.
+
+    The side that meets first says when. The other one takes part if it has met by then, too, but for δ. Else
+    it is left to the next step, unless the bodies rest on it: then impulses act from the start of the step.
+
+    Args:
+        room: Where the sides stand.
+        world: The world.
+        earlier: The side that meets first.
+        later: The other one.
+        h: Timestep [s].
+    """
+    ahead = room.found[world, earlier]
+    behind = room.found[world, later]
+    way = (behind.share - ahead.share) * h * -behind.patch.near_rate / behind.patch.near_load
+    until = ahead.impact.delays * ahead.share
+    rests = way > behind.impact.depth and touches(room, world, behind)
+    if way > behind.impact.depth and not rests:
+        leave_to_next(room, world, later, h)
+    elif rests or until <= ZERO:
+        room.found[world, earlier].impact = delayed(ahead.impact, ZERO, ahead.share, h)
+        room.found[world, later].impact = delayed(behind.impact, ZERO, behind.share, h)
+    else:
+        room.found[world, later].impact = delayed(behind.impact, until / behind.share, behind.share, h)
+
+
+@wp.func
+def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
+    """Have both sides of a pair take part in one impact: samples of the first body, and of the second."""
+    h = scene.timestep[world, 0]
+    for f in range(1, n_found):
+        one = (f - 1) * _LANES + lane
+        other = f * _LANES + lane
+        mine = scene.pair_index[room.found[world, one].pair]
+        theirs = scene.pair_index[room.found[world, other].pair]
+        if mine.first == theirs.second and mine.second == theirs.first:
+            if wp.static(not TREES):
+                both_move = scene.body_index[mine.first].row >= 0 and scene.body_index[mine.second].row >= 0
+                first = room.found[world, one]
+                second = room.found[world, other]
+                if both_move and first.impact.stiffness > ZERO and second.impact.stiffness > ZERO:
+                    if first.share <= second.share:
+                        agree_on_moment(room, world, one, other, h)
+                    else:
+                        agree_on_moment(room, world, other, one, h)
+            if (
+                room.found[world, one].impact.stiffness > ZERO
+                and room.found[world, other].impact.stiffness > ZERO
+            ):
+                room.found[world, one].impact.part = HALF
+                room.found[world, other].impact.part = HALF
+
+
+@wp.func
+def any_hits(room: wp.ref[Room], world: int, lane: int, n_found: int) -> bool:
+    """Whether one of the pairs with points has an impact."""
+    hits = bool(False)
+    for f in range(n_found):
+        hits = hits or room.found[world, f * _LANES + lane].impact.stiffness > ZERO
+    return hits
+
+
+@wp.func
+def note_partner(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int, holds: bool):
+    """Note that a body has an impact with another one, or with several, and whether that one holds it."""
+    if scene.body_index[body].row >= 0:
+        if holds:
+            room.bodies[world, body].held = ONE
+        elif room.partners[world, body] == _NOBODY or room.partners[world, body] == other:
+            room.partners[world, body] = other
+        else:
+            room.partners[world, body] = _SEVERAL
+
+
+@wp.func
+def find_partners(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, n_near: int):
+    """With which other one each body has an impact, and whether others hold it meanwhile."""
+    if lane == 0:
+        for i in range(scene.body_index.shape[0]):
+            room.partners[world, i] = _NOBODY
+    for f in range(n_near):
+        found = room.found[world, f * _LANES + lane]
+        quiet = bool(False)
+        holds = bool(False)
+        if f < n_found and found.impact.stiffness == ZERO:
+            quiet = is_quiet(scene, room, world, found)
+            holds = quiet and touches(room, world, found)
+        if lane == 0 and (holds or not quiet):
+            index = scene.pair_index[found.pair]
+            note_partner(scene, room, world, index.first, index.second, holds)
+            note_partner(scene, room, world, index.second, index.first, holds)
+
+
+@wp.func
+def waits(room: wp.ref[Room], world: int, body: int, other: int, found: FoundPair) -> int:
+    """1 where impulses on a body take effect when it meets another one, else 0."""
+    # What it rests on until then knows of no others.
+    carried = wp.length_sq(found.support) > ZERO and room.bodies[world, body].held > ZERO
+    return wp.where(room.partners[world, body] == other and not carried, 1, 0)
+
+
+@wp.func
+def support_before(found: FoundPair) -> vec6:
+    """Impulse of what a pair rests on, from the middle of the step before to when it meets."""
+    return (found.impact.part * found.impact.delays * (HALF + found.share)) * found.support
+
+
+@wp.func
+def support_on_way(found: FoundPair) -> vec6:
+    """The same, as the way until then feels it."""
+    return (found.impact.part * found.impact.delays * (HALF + HALF * found.share)) * found.support
 
 
 @wp.func
@@ -59,29 +176,20 @@ def apart_at_start(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: 
 
 
 @wp.func
-def support_before(found: FoundPair) -> vec6:
-    """Impulse of what a pair rests on, from the middle of the step before to when it meets."""
-    return (found.impact.part * found.impact.delays * (HALF + found.share)) * found.support
-
-
-@wp.func
-def support_delayed(found: FoundPair) -> vec6:
-    """Impulse by which positions change less than velocities do, of what a pair rests on until it meets."""
-    share = found.share
-    return (found.impact.part * found.impact.delays * HALF * share * share) * found.support
-
-
-@wp.func
 def add_support(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair):
-    """Add what a pair rests on until it meets to its bodies' momenta."""
+    """Add what a pair rests on until it meets to its bodies' momenta, and to their ways."""
     index = scene.pair_index[found.pair]
     a = scene.body_index[index.first].row
     b = scene.body_index[index.second].row
     impulse = support_before(found)
+    on_way = support_on_way(found)
+    apart = apart_at_start(scene, room, world, found)
     if a >= 0:
         room.momentum[world, a] += impulse
+        room.bodies[world, index.first].support += on_way
     if b >= 0:
-        room.momentum[world, b] -= wrench_at(impulse, apart_at_start(scene, room, world, found))
+        room.momentum[world, b] -= wrench_at(impulse, apart)
+        room.bodies[world, index.second].support -= wrench_at(on_way, apart)
 
 
 @wp.func
@@ -94,21 +202,19 @@ def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_fou
     for i in range(scene.moving.shape[0]):
         room.meetings[world, i] = vec3()
     for f in range(n_found):
-        delays = room.found[world, f * _LANES].impact.delays
-        if delays > ZERO:
-            found = room.found[world, f * _LANES]
-            if wp.length_sq(found.support) > ZERO:
-                add_support(scene, room, world, found)
-            index = scene.pair_index[found.pair]
-            waits = vec3(ONE, delays, delays * found.share)
-            if found.first_waits > 0:
-                room.meetings[world, scene.body_index[index.first].row] += waits
-            if found.second_waits > 0:
-                room.meetings[world, scene.body_index[index.second].row] += waits
+        found = room.found[world, f * _LANES]
+        index = scene.pair_index[found.pair]
+        met = vec3(ONE, found.impact.delays, found.impact.delays * found.share)
+        if found.first_waits > 0:
+            room.meetings[world, scene.body_index[index.first].row] += met
+        if found.second_waits > 0:
+            room.meetings[world, scene.body_index[index.second].row] += met
+        if found.first_waits + found.second_waits > 0 and wp.length_sq(found.support) > ZERO:
+            add_support(scene, room, world, found)
     for i in range(scene.moving.shape[0]):
-        body = scene.moving[i]
-        met = meetings_of(scene, room, world, body)
+        met = room.meetings[world, i]
         if met[0] > ZERO:
+            body = scene.moving[i]
             room.bodies[world, body].met = met[2] / met[0]
             room.bodies[world, body].lead = ONE - met[1] / met[0]
             rotation = rotation_met(room.bodies[world, body])
@@ -116,32 +222,68 @@ def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_fou
 
 
 @wp.func
-def freed(room: wp.ref[Room], world: int, i: int, row: int, impulse: vec6) -> vec6:
-    """M⁻¹ P: change of a body's velocity and spin by an impulse, by its number and its row."""
-    linear = room.bodies[world, i].inverse_mass * linear_part(impulse)
-    return joined(linear, wp.inverse(room.inertia[world, row]) * angular_part(impulse))
+def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, n_near: int):
+    """Have impulses on a body that has an impact with one other, and at most lies on others, wait for it.
+
+    What is hit from two sides would else go on by what one of them does until the other begins: in a corner
+    that friction jams, the two impulses have no bound.
+    """
+    if not any_hits(room, world, lane, n_found):
+        return
+    h = scene.timestep[world, 0]
+    wait()
+    find_partners(scene, room, world, lane, n_found, n_near)
+    wait()
+    for f in range(n_found):
+        k = f * _LANES + lane
+        found = room.found[world, k]
+        if found.impact.delays > ZERO:
+            index = scene.pair_index[found.pair]
+            found.first_waits = waits(room, world, index.first, index.second, found)
+            found.second_waits = waits(room, world, index.second, index.first, found)
+            if found.first_waits + found.second_waits == 0:
+                found.impact = delayed(found.impact, ZERO, found.share, h)
+            room.found[world, k] = found
+    wait()
+    if lane == 0:
+        balance_when_met(scene, room, world, n_found)
+    wait()
+    for f in range(n_found):
+        k = f * _LANES + lane
+        found = room.found[world, k]
+        index = scene.pair_index[found.pair]
+        a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
+        room.found[world, k].com_difference = centres_apart(a, b, h)
 
 
 @wp.func
-def find_moved(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Velocities by which positions change within a step that is solved, in `room.moved`."""
-    if lane == 0:
-        for b in range(scene.n_blocks):
-            room.moved[world, b] = room.velocity[world, b]
-    wait()
+def end_of_step(row: StateRow, state: BodyState, inertia: mat33, velocity: vec6, h: real) -> StateRow:
+    """A body at the end of a step: x⁺ = x + h v⁺, q⁺ = q ⊗ turn, where no impulse waits.
+
+    Args:
+        row: When the step begins.
+        state: The same, as contact sees it.
+        inertia: [kg m², B].
+        velocity: V⁺ of the balance [W].
+        h: Timestep [s].
+    """
+    after = StateRow()
+    q = from_wxyz(row.orientation)
+    back = wp.transpose(matrix(q))
+    after.velocity = linear_part(velocity)
+    moved = velocity
+    omega = back * angular_part(velocity)
+    orientation = turned(q, omega, h)
     if wp.static(not TREES):
-        for f in range(n_found):
-            found = room.found[world, f * _LANES + lane]
-            if found.impact.delays > ZERO:
-                impulse = (found.impact.delays * found.share) * pair_impulse(scene, room, world, found)
-                held = support_delayed(found)
-                if lane == 0:
-                    index = scene.pair_index[found.pair]
-                    if found.first_waits > 0:
-                        a = scene.body_index[index.first].row
-                        room.moved[world, a] -= freed(room, world, index.first, a, impulse + held)
-                    if found.second_waits > 0:
-                        b = scene.body_index[index.second].row
-                        back = wrench_at(impulse, found.com_difference)
-                        back += wrench_at(held, apart_at_start(scene, room, world, found))
-                        room.moved[world, b] += freed(room, world, index.second, b, back)
+        if state.lead < ONE:
+            moved = moved_in_impact(state, velocity)
+            end = end_of_impact(
+                angular_part(velocity), inertia, rotation_met(state), q, angular_part(moved), state.spin_gain,
+                h, state.met, state.lead,
+            )  # fmt: skip
+            omega = end.omega
+            orientation = end.orientation
+    after.position = row.position + h * linear_part(moved)
+    after.orientation = to_wxyz(orientation)
+    after.omega = omega
+    return after

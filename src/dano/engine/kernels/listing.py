@@ -3,7 +3,7 @@
 import warp as wp
 
 from dano.engine.kernels.lanes import wait
-from dano.engine.kernels.rollout import begin_unpushed, Launch
+from dano.engine.kernels.rollout import begin_again, Launch
 from dano.engine.kernels.search import find_contacts
 from dano.engine.kernels.tables import Room, Scene
 from dano.physics.features import LANES
@@ -52,7 +52,7 @@ def listing(scene: Scene, room: Room, launch: Launch, listing: Listing):
     """The points that may press within a step from `launch.state`."""
     block, lane = wp.tid()
     world = launch.first_world + block
-    begin_unpushed(scene, room, world, lane, launch, 0)
+    begin_again(scene, room, world, lane, launch, 0)
     n_found, overflow = find_contacts(scene, room, world, lane)
     wait()
     # Lists of lanes stand one after the other in the room, and without gaps among the rows.

@@ -129,25 +129,13 @@ def left_out(found: FoundPair, factor: real) -> real:
 @wp.func
 def as_they_meet(a: BodyState, b: BodyState, found: FoundPair, h: real) -> tuple[BodyState, BodyState]:
     """Bodies of a pair with what their velocities gain until they meet: by gravity, and what they rest on."""
-    first = falling(a, found.falls)
-    second = falling(b, found.falls)
+    first = falling(a, found.first_falls)
+    second = falling(b, found.second_falls)
     if wp.static(not TREES):
         if wp.length_sq(found.support) > ZERO:
             first = supported(first, found.support, h)
             second = supported(second, -wrench_at(found.support, a.position - b.position), h)
     return first, second
-
-
-@wp.func
-def first_until(found: FoundPair) -> real:
-    """Share of the step after which impulses on the first body of a pair take effect."""
-    return real(found.first_waits) * found.impact.delays * found.share
-
-
-@wp.func
-def second_until(found: FoundPair) -> real:
-    """Share of the step after which impulses on the second body of a pair take effect."""
-    return real(found.second_waits) * found.impact.delays * found.share
 
 
 @wp.func

@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from dano.engine.kernels.impacts import balance_when_met, find_moved
+from dano.engine.kernels.impacts import any_hits, end_of_step, let_wait
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import find_pattern, forget_blocks
 from dano.engine.kernels.patches import find_patches
 from dano.engine.kernels.search import find_contacts, fix_laws
-from dano.engine.kernels.sleep import fall_asleep, is_at_rest, sleeps, wake, wake_all
+from dano.engine.kernels.sleep import all_sleep, fall_asleep, is_at_rest, sleeps, wake, wake_all
 from dano.engine.kernels.solve import Options, solve, Solved
 from dano.engine.kernels.sweep import forget_candidates
 from dano.engine.kernels.tables import Push, Room, Scene, StateRow, StepReport
@@ -22,8 +22,8 @@ from dano.engine.kernels.trees.kinematics import (
 )
 from dano.engine.kernels.trees.loops import begin_loops, forces_of
 from dano.physics.features import LANES, PATCHES, TREES
-from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
-from dano.physics.pairs import BodyState, rotation_met
+from dano.physics.momentum import angular_momentum, gyroscopic_gain, turned_inertia
+from dano.physics.pairs import BodyState
 from dano.physics.real import HALF, ONE, real, vec3, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turned
 from dano.physics.trees.joints import ROOT
@@ -114,6 +114,7 @@ def begin_body(
     state.ahead = state.orientation
     state.ahead_falling = state.orientation
     state.lead = ONE
+    state.support = h * joined(push.force, push.torque)
     state.com = body.com
     size = ZERO
     if m >= 0:
@@ -301,15 +302,15 @@ def stays_asleep(
 
 
 @wp.func
-def begin_unpushed(
+def begin_again(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, launch: wp.ref[Launch], t: int
 ):
-    """What is known at the start of a step that was not, or need not be, pushed."""
+    """What is known at the start of a step that is made already."""
     if t == 0 or t == launch.n_steps - 1:
         # A launch begins with one of these.
         forget(scene, room, world, lane)
     for i in range(scene.body_index.shape[0]):
-        push = Push()
+        push = push_of(scene, launch, world, t, i)
         begin_body(scene, room, world, i, row_before(scene, launch, world, t, i), push)
     wait()
     if wp.static(TREES):
@@ -328,29 +329,18 @@ def find_touching(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
         room for.
     """
     n_found, overflow = find_contacts(scene, room, world, lane)
-    if wp.static(not TREES):
-        wait()
-        if lane == 0:
-            balance_when_met(scene, room, world, n_found)
     n_near = n_found
     if wp.static(PATCHES):
         n_near = find_patches(scene, room, world, lane, n_found)
     wait()
+    if wp.static(not TREES):
+        let_wait(scene, room, world, lane, n_found, n_near)
     return n_found, n_near, overflow
 
 
 @wp.func
-def any_hits(room: wp.ref[Room], world: int, lane: int, n_found: int) -> bool:
-    """Whether one of the pairs with points has an impact."""
-    hits = bool(False)
-    for f in range(n_found):
-        hits = hits or room.found[world, f * _LANES + lane].impact.stiffness > ZERO
-    return hits
-
-
-@wp.func
 def advance_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, row: StateRow) -> StateRow:
-    """A body at the end of a step: x⁺ = x + h v, q⁺ = q ⊗ turn, with v and turn of `Room.moved`."""
+    """A body at the end of a step, see `end_of_step`."""
     h = scene.timestep[world, 0]
     m = scene.body_index[i].row
     after = row
@@ -360,22 +350,8 @@ def advance_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, r
             if node.kind != _ROOT:
                 return advance_hanging(room, world, m, i, row)
             m = node.place // 6
-        v = room.velocity[world, m]
-        state = room.bodies[world, i]
-        moved = room.moved[world, m]
-        back = wp.transpose(matrix(state.orientation))
-        turn = angular_part(moved)
-        after.velocity = linear_part(v)
-        after.omega = back * angular_part(v)
-        if state.lead < ONE:
-            end = end_of_impact(
-                angular_part(v), scene.bodies[world, i].inertia, rotation_met(state), state.spin_gain, h,
-                state.met, state.lead,
-            )  # fmt: skip
-            after.omega = end.omega
-            turn = turn + end.turn
-        after.position = row.position + h * linear_part(moved)
-        after.orientation = to_wxyz(turned(state.orientation, back * turn, h))
+        inertia = scene.bodies[world, i].inertia
+        after = end_of_step(row, room.bodies[world, i], inertia, room.velocity[world, m], h)
     return after
 
 
@@ -402,36 +378,39 @@ def rollout(scene: Scene, room: Room, launch: Launch):
                 begin_step_of_trees(scene, room, world, launch, t)
             wait()
             size = wp.max(size, room.trees.sizes[world, 0])
-        n_found, n_near, overflow = find_touching(scene, room, world, lane)
-        if lane == 0:
-            find_pattern(scene, room, world, n_near)
-        hits = any_hits(room, world, lane, n_found)
-        # A solve that cycles returns its best velocities: from there, with fitting duals, most converge.
-        attempt = int(0)
-        restarts = int(0)
-        again = bool(True)
+        n_found = int(0)
+        overflow = bool(False)
         solved = Solved()
+        solved.converged = True
         rebound = real(1.0)
-        while again:
-            rebound = ONE - real(attempt) / real(_REBOUNDS)
-            fix_laws(scene, room, world, lane, n_found, rebound, False)
-            wait()
-            solved = solve(scene, room, world, lane, n_found, size, launch.options)
-            again = False
-            if not solved.converged and restarts < _RESTARTS:
-                restarts += 1
-                again = True
-            elif hits and attempt < _REBOUNDS:
-                if adds_energy(scene, room, world):
-                    attempt += 1
+        # What sleeps on is near nothing that it was not near before.
+        if not all_sleep(scene, room, world):
+            n_found, n_near, overflow = find_touching(scene, room, world, lane)
+            if lane == 0:
+                find_pattern(scene, room, world, n_near)
+            hits = any_hits(room, world, lane, n_found)
+            # A solve that cycles returns its best velocities: from there, with fitting duals, most converge.
+            attempt = int(0)
+            restarts = int(0)
+            again = bool(True)
+            while again:
+                rebound = ONE - real(attempt) / real(_REBOUNDS)
+                fix_laws(scene, room, world, lane, n_found, rebound, False)
+                wait()
+                solved = solve(scene, room, world, lane, n_found, size, launch.options)
+                again = False
+                if not solved.converged and restarts < _RESTARTS:
+                    restarts += 1
                     again = True
-                    wait()
-                    if lane == 0:
-                        restart(scene, room, world)
-                    wait()
-        wait()
-        find_moved(scene, room, world, lane, n_found)
-        wait()
+                elif hits and attempt < _REBOUNDS:
+                    if adds_energy(scene, room, world):
+                        attempt += 1
+                        again = True
+                        wait()
+                        if lane == 0:
+                            restart(scene, room, world)
+                        wait()
+            wait()
         if lane == 0:
             report = StepReport()
             report.residual = solved.residual

@@ -7,18 +7,17 @@ is listed if the old velocities take it into the other body by the end of the st
 
 import warp as wp
 
-from dano.engine.kernels.lanes import lanes_where, total, total3, wait
+from dano.engine.kernels.impacts import share_impacts
+from dano.engine.kernels.lanes import lanes_where, total, total3
 from dano.engine.kernels.meeting import Meeting, meeting
 from dano.engine.kernels.near import (
     as_they_meet,
     facing,
-    first_until,
     is_near,
     left_out,
     plane_of,
     posed,
     reach_of_block,
-    second_until,
     solid_of_body,
     stretch_of,
 )
@@ -52,13 +51,13 @@ from dano.physics.impacts import (
 )
 from dano.physics.pairs import (
     BodyState,
-    centres_apart,
     falling,
+    is_held,
     PairPose,
     speed_within,
 )
 from dano.physics.point_law import gate_of, Material, point_law
-from dano.physics.real import HALF, ONE, real, TWO, vec3, vec6, ZERO
+from dano.physics.real import ONE, real, TWO, vec3, vec6, ZERO
 from dano.physics.samples import (
     facing_area,
     is_turned,
@@ -71,8 +70,6 @@ from dano.physics.solids.distances import solid_clearance, solid_distance
 from dano.physics.solids.grids import STEEPEST
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
-# What a body touches, besides one other.
-_NOTHING, _SEVERAL = wp.constant(-1), wp.constant(-2)
 
 
 @wp.func
@@ -249,8 +246,7 @@ def impact_of(
         found: What is found of the pair.
         pair: The pair.
         turning: How samples turn with the first body.
-        alone: Whether one of the bodies is fixed and the other moves freely. Then impulses take effect when
-            they meet; between two that move, this would not conserve angular momentum.
+        alone: Whether one of the bodies is fixed.
     """
     impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, material.timestep)
     if patch.load > ZERO:
@@ -259,7 +255,9 @@ def impact_of(
             impact.stiffness = stiffness_of_impact(
                 a, b, patch, material.bounce, pair.factor, material.timestep
             )
-            delays = wp.where(alone, impact.share, ZERO)
+            delays = real(0.0)
+            if wp.static(not TREES):
+                delays = impact.share
             impact = delayed(impact, delays, found.share, material.timestep)
             impact.rests = left_out(found, pair.factor)
             if alone:
@@ -309,23 +307,6 @@ def find_rest(
 
 
 @wp.func
-def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Halve impacts that samples of both bodies have part in."""
-    for f in range(1, n_found):
-        one = f * _LANES + lane
-        other = one - _LANES
-        mine = scene.pair_index[room.found[world, one].pair]
-        theirs = scene.pair_index[room.found[world, other].pair]
-        if mine.first == theirs.second and mine.second == theirs.first:
-            if (
-                room.found[world, one].impact.stiffness > ZERO
-                and room.found[world, other].impact.stiffness > ZERO
-            ):
-                room.found[world, one].impact.part = HALF
-                room.found[world, other].impact.part = HALF
-
-
-@wp.func
 def lasting_meeting(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
@@ -343,46 +324,6 @@ def lasting_meeting(
     return meeting(
         scene, room, world, lane, falling(a, 0), falling(b, 0), pair, first, second, h, sink, sink, ZERO, ZERO
     )
-
-
-@wp.func
-def note_partner(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int):
-    """Note that a body touches another one; of several, `_SEVERAL`."""
-    if scene.body_index[body].row >= 0:
-        before = room.partners[world, body]
-        room.partners[world, body] = wp.where(before == _NOTHING or before == other, other, _SEVERAL)
-
-
-@wp.func
-def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Have impulses of impacts take effect when bodies meet, on those that touch no others.
-
-    What is pressed from two sides would else go on by what one of them does until the other begins: in a
-    corner that friction jams, the two impulses have no bound.
-    """
-    wait()
-    if lane == 0:
-        for i in range(scene.body_index.shape[0]):
-            room.partners[world, i] = _NOTHING
-        for f in range(n_found):
-            index = scene.pair_index[room.found[world, f * _LANES].pair]
-            note_partner(scene, room, world, index.first, index.second)
-            note_partner(scene, room, world, index.second, index.first)
-    wait()
-    h = scene.timestep[world, 0]
-    for f in range(n_found):
-        k = f * _LANES + lane
-        found = room.found[world, k]
-        if found.impact.delays > ZERO:
-            first = scene.pair_index[found.pair].first
-            second = scene.pair_index[found.pair].second
-            found.first_waits = wp.where(room.partners[world, first] == second, 1, 0)
-            found.second_waits = wp.where(room.partners[world, second] == first, 1, 0)
-            if found.first_waits + found.second_waits == 0:
-                found.impact = delayed(found.impact, ZERO, found.share, h)
-            a, b = as_they_meet(room.bodies[world, first], room.bodies[world, second], found, h)
-            found.com_difference = centres_apart(a, b, first_until(found), second_until(found), h)
-            room.found[world, k] = found
 
 
 @wp.func
@@ -404,9 +345,16 @@ def find_pair(
     b = room.bodies[world, index.second]
     material = scene.materials[world, index.contact]
     alone = bool(False)
+    # Others hold what hardly moves.
+    first_falls = int(1)
+    second_falls = int(1)
+    since = real(0.0)
     if wp.static(not TREES):
         alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
-    since = wp.where(alone, -ONE, ZERO)
+        since = -ONE
+        if not alone:
+            first_falls = wp.where(is_held(a), 0, 1)
+            second_falls = wp.where(is_held(b), 0, 1)
     found = FoundPair()
     found.pair = p
     found.first = at
@@ -419,7 +367,7 @@ def find_pair(
     met = Meeting()
     if not lasts:
         met = meeting(
-            scene, room, world, lane, falling(a, 1), falling(b, 1), pair, index.first,
+            scene, room, world, lane, falling(a, first_falls), falling(b, second_falls), pair, index.first,
             index.second, h, pair.impact_depth, slow, slow, since,
         )  # fmt: skip
         # What moves so slowly has no impact.
@@ -431,7 +379,8 @@ def find_pair(
             # What it rests on goes on to press until it meets, and says when that is.
             found.rest = find_rest(scene, room, world, lane, a, b, p)
             if found.rest.load > ZERO:
-                found.falls = 1
+                found.first_falls = 1
+                found.second_falls = 1
                 seen = falling(a, 1)
                 other = falling(b, 1)
                 found.support = support_of(seen, other, found.rest, material.friction, h, turning)
@@ -445,8 +394,9 @@ def find_pair(
     while again:
         again = False
         found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
-        found.falls = wp.where(not lasts and met.nears, 1, 0)
-        if found.falls == 0:
+        found.first_falls = wp.where(not lasts and met.nears, first_falls, 0)
+        found.second_falls = wp.where(not lasts and met.nears, second_falls, 0)
+        if lasts or not met.nears:
             found.support = vec6()
         found.critical = met.critical
         found.share = met.share
@@ -480,7 +430,7 @@ def find_pair(
                 met = lasting_meeting(
                     scene, room, world, lane, a, b, pair, index.first, index.second, h, sink
                 )
-            again = met.share != before or found.falls > 0
+            again = met.share != before or found.first_falls + found.second_falls > 0
     seen, other = as_they_meet(a, b, found, h)
     found.toward = facing(scene, world, seen, other, index.first, index.second, found.share, h)
     found.end = wp.min(after, end)
@@ -526,8 +476,6 @@ def find_contacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
             if total(real(at - begin)) > ZERO:
                 n_found += 1
     share_impacts(scene, room, world, lane, n_found)
-    if wp.static(not TREES):
-        let_wait(scene, room, world, lane, n_found)
     return n_found, total(wp.where(overflow, ONE, ZERO)) > ZERO
 
 

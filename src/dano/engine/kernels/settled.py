@@ -3,18 +3,18 @@
 import warp as wp
 
 from dano.engine.kernels.assembly import assemble, fit_duals, Trial
-from dano.engine.kernels.impacts import find_moved
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import EVERYWHERE, find_pattern
 from dano.engine.kernels.patches import add_patches, fit_patch_duals
-from dano.engine.kernels.rollout import begin_unpushed, find_touching, Launch
+from dano.engine.kernels.rollout import begin_again, find_touching, Launch
 from dano.engine.kernels.search import fix_laws
 from dano.engine.kernels.tables import Room, Scene
 from dano.engine.kernels.trees.balance import add_tree_slopes, fit_joint_duals
 from dano.physics.features import PATCHES, TREES
-from dano.physics.momentum import spin_seen_from
+from dano.physics.momentum import angular_momentum, spin_with
 from dano.physics.pairs import rotation_met
-from dano.physics.real import ONE, TWO
+from dano.physics.real import ONE
+from dano.physics.rotations import from_wxyz, matrix
 from dano.physics.trees.joints import ROOT
 from dano.physics.twists import joined
 
@@ -58,7 +58,7 @@ def settle(
 ) -> int:
     """A step at its solution: contacts, laws and the Jacobian; returns the number of pairs with points."""
     n = scene.body_index.shape[0]
-    begin_unpushed(scene, room, world, lane, launch, t)
+    begin_again(scene, room, world, lane, launch, t)
     n_found, n_near, _overflow = find_touching(scene, room, world, lane)
     if lane == 0:
         find_pattern(scene, room, world, n_near)
@@ -70,8 +70,10 @@ def settle(
                 omega = row.omega
                 if state.lead < ONE:
                     inertia = scene.bodies[world, i].inertia
-                    omega = spin_seen_from(
-                        omega, inertia, scene.timestep[world, 0], ONE - TWO * state.met, state.lead
+                    h = scene.timestep[world, 0]
+                    ended = matrix(from_wxyz(row.orientation)) * angular_momentum(omega, inertia, h, -ONE)
+                    omega = spin_with(
+                        wp.transpose(rotation_met(state)) * ended, omega, inertia, h, state.lead
                     )
                 spin = rotation_met(state) * omega
                 room.velocity[world, block_of(scene, m)] = joined(row.velocity, spin)
@@ -96,6 +98,4 @@ def settle(
         if lane == 0:
             add_tree_slopes(scene, room, world)
         wait()
-    find_moved(scene, room, world, lane, n_found)
-    wait()
     return n_found

@@ -39,6 +39,14 @@ def sleeps(room: wp.ref[Room], world: int, row: int) -> bool:
 
 
 @wp.func
+def all_sleep(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> bool:
+    """Whether every body that moves sleeps: then nothing is near anything that it was not near before."""
+    if wp.static(ISLANDS):
+        return scene.n_blocks > 0 and room.lasting[world, 0].asleep == scene.n_blocks
+    return False
+
+
+@wp.func
 def wake(scene: wp.ref[Scene], room: wp.ref[Room], world: int, row: int):
     """Wake the island of a body. What the room holds of it is what a step would begin with."""
     island = room.asleep[world, row]

@@ -207,7 +207,9 @@ class FoundPair:
     critical: wp.int32  # Sample that says when the bodies meet, −1 where they do not within the step
     share: real  # τ
     hits: wp.int32  # 1 where τ is when the bodies are as deep as in an impact
-    falls: wp.int32  # 1 where bodies fall freely until they meet: then gravity takes part in their way
+    # 1 where the first or the second body falls freely until they meet: then gravity takes part in its way.
+    first_falls: wp.int32
+    second_falls: wp.int32
     # 1 where impulses of an impact on the first or the second body take effect when the bodies meet.
     first_waits: wp.int32
     second_waits: wp.int32
@@ -318,7 +320,7 @@ class Room:
         sorted: Bodies along an axis.
         marked: A bit for each pair that is a candidate.
         candidates: Pairs that may be near.
-        partners: The body that a body touches, see `dano.engine.kernels.search`.
+        partners: The body that a body has an impact with, see `dano.engine.kernels.impacts`.
         found: Pairs that are near, then those whose patches touch, shape (worlds, pairs · lanes).
         where: Of each point where it was found, shape (worlds, capacity).
         points: The points.
@@ -353,9 +355,7 @@ class Room:
         old: Those of the step before; only with joints.
         tried: …
         best: Where the residual was smallest.
-        moved: By which positions change within a step.
         meetings: Of each moving body what waits for when it meets others, see `dano.engine.kernels.impacts`.
-        late: Virtual velocities of impulses that take effect within a step.
         step: Of Newton's method.
         residual: What each block misses [kg m/s; kg m²/s, W].
         scale: Turns momenta into velocities [1/kg; 1/(kg m²)].
@@ -418,7 +418,6 @@ class Room:
     old: wp.array2d(dtype=vec6)
     tried: wp.array2d(dtype=vec6)
     best: wp.array2d(dtype=vec6)
-    moved: wp.array2d(dtype=vec6)
     meetings: wp.array2d(dtype=vec3)
     step: wp.array2d(dtype=vec6)
     residual: wp.array2d(dtype=vec6)
@@ -427,7 +426,6 @@ class Room:
     trees: TreeRoom
     wrenches: wp.array2d(dtype=vec6)
     if ADJOINTS:
-        late: wp.array2d(dtype=vec6)
         given: Given
         given_trees: GivenTrees
         given_patches: GivenPatches

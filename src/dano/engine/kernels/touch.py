@@ -2,10 +2,11 @@
 
 import warp as wp
 
+from dano.engine.kernels.impacts import any_hits
 from dano.engine.kernels.lanes import total, total3, wait
 from dano.engine.kernels.linear_solve import EVERYWHERE
 from dano.engine.kernels.patches import contact_of
-from dano.engine.kernels.rollout import any_hits, begin_unpushed, find_touching, Launch, REBOUNDS
+from dano.engine.kernels.rollout import begin_again, find_touching, Launch, REBOUNDS
 from dano.engine.kernels.settled import settle
 from dano.engine.kernels.solve import newton_step
 from dano.engine.kernels.tables import Room, Scene
@@ -80,7 +81,7 @@ def touch(scene: Scene, room: Room, launch: Launch, seen: Seen):
     """Overlaps at `launch.state`, in which nothing moves."""
     block, lane = wp.tid()
     world = launch.first_world + block
-    begin_unpushed(scene, room, world, lane, launch, 0)
+    begin_again(scene, room, world, lane, launch, 0)
     for p in range(lane, seen.overlaps.shape[1], _LANES):
         seen.overlaps[world, p] = Overlap()
     wait()

@@ -253,7 +253,7 @@ def _pullback_plan(forward: LaunchPlan, which: tuple[int, ...]) -> LaunchPlan:
 def _pulling_room(forward: LaunchPlan) -> dict[str, int]:
     """Lengths of what a world needs besides for derivatives of a step's equations."""
     n = forward.room["room.bodies"]
-    room: dict[str, int] = {"room.body_bars": n, "room.late": forward.room["room.velocity"]}
+    room: dict[str, int] = {"room.body_bars": n}
     if "scene.patches.sides" in forward.inputs:
         sides = forward.inputs["scene.patches.sides"].rows
         room |= {"room.patches.sums": sides, "room.patches.sum_bars": sides}

@@ -176,7 +176,7 @@ def room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> di
     lengths = {
         **dict.fromkeys(("bodies", "partners", "sizes"), n),
         **dict.fromkeys(("momentum", "inertia", "meetings"), m),
-        **dict.fromkeys(("velocity", "old", "tried", "best", "moved", "step", "residual", "scale"), blocks),
+        **dict.fromkeys(("velocity", "old", "tried", "best", "step", "residual", "scale"), blocks),
         **dict.fromkeys(
             ("order", "counts", "degrees", "neighbours", "islands", "members", "of_islands"), blocks
         ),

@@ -1,6 +1,13 @@
 """Pictures of fields: solids, media and learned models under lamps and a sky."""
 
-from dano.vision.drawing._composed import compose as compose, Part as Part, through as through
+from dano.vision.drawing._composed import (
+    colours_under as colours_under,
+    compose as compose,
+    Part as Part,
+    Places as Places,
+    places_seen as places_seen,
+    through as through,
+)
 from dano.vision.drawing._item import (
     checked_colour as checked_colour,
     Item as Item,

@@ -323,20 +323,14 @@ def through(
     colour, depth = jnp.zeros((n, 3), jnp.float32), jnp.zeros(n, jnp.float32)
     shares = []
     for i, (own, (edges, _), weight) in enumerate(zip(rays, found, weights, strict=True)):
-        middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-        k = min(sampling.colours, weight.shape[1])
-        _, chosen = jax.lax.top_k(weight, k)
-        some = jnp.take_along_axis(weight, chosen, axis=1)
-        t = jnp.take_along_axis(middle, chosen, axis=1)
-        world = (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3)
-        view = jnp.repeat(own.direction, k, axis=0)
-        send = functools.partial(radiance, parts, i, lamps[i], world, own.at(t), view, ambient)
-        light = jax.lax.cond(jnp.any(weight > 0), send, lambda world=world: jnp.zeros_like(world))
-        share = jnp.sum(weight, axis=1)
-        whole = (share / jnp.maximum(jnp.sum(some, axis=1), _GONE))[:, None]
-        colour = colour + composite(some, light.reshape(n, k, 3)) * whole
-        depth = depth + jnp.sum(weight * middle, axis=1)
-        shares.append(share)
+        places = _places(own, edges, weight, origins, directions, sampling)
+        send = functools.partial(
+            radiance, parts, i, lamps[i], places.world, places.local, places.view, ambient
+        )
+        light = jax.lax.cond(jnp.any(weight > 0), send, lambda world=places.world: jnp.zeros_like(world))
+        colour = colour + places.mixed(light)
+        depth = depth + jnp.sum(weight * 0.5 * (edges[:, 1:] + edges[:, :-1]), axis=1)
+        shares.append(places.opacity)
     return colour, depth, shares, clear
 
 
@@ -384,6 +378,63 @@ def shared_weights(
         weights.append(jnp.maximum(jnp.diff(jnp.take_along_axis(mine, at, axis=1), axis=1), 0))
         start += own.shape[1]
     return weights, jnp.exp(-passed[:, -1])
+
+
+class Places(NamedTuple):
+    """The places of one part that rays see most of: light does not change which these are."""
+
+    world: Float[Array, "nk 3"]  # [m, W], k for each ray
+    local: Float[Array, "nk 3"]  # [m], in the part's frame
+    view: Float[Array, "nk 3"]  # Unit directions of view there
+    weights: Float[Array, "n k"]  # Share of a ray that each of them has
+    opacity: Float[Array, " n"]  # Of the part
+
+    def mixed(self, light: Float[Array, "nk 3"]) -> Float[Array, "n 3"]:
+        """What rays see, over black, if these places send this."""
+        whole = (self.opacity / jnp.maximum(jnp.sum(self.weights, axis=1), _GONE))[:, None]
+        return composite(self.weights, light.reshape(*self.weights.shape, 3)) * whole
+
+
+def places_seen(
+    part: Part, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], sampling: Sampling
+) -> Places:
+    """The places of a part that rays see most of, if nothing else is there.
+
+    Args:
+        part: What is there.
+        origins: Where rays begin [m, W].
+        directions: Unit vectors [W].
+        sampling: How finely rays are sampled.
+    """
+    rays = part.local(origins, directions, jnp.full(len(directions), jnp.inf, directions.dtype))
+    edges, alpha = part.sections(rays, sampling)
+    (weights,), _ = shared_weights([edges], [alpha], len(directions))
+    return _places(rays, edges, weights, origins, directions, sampling)
+
+
+def colours_under(part: Part, places: Places, lamp: Light) -> Float[Array, "n 3"]:
+    """SRGB over black that rays see of a part with a learned look, and of nothing else, under one lamp.
+
+    Args:
+        part: The part.
+        places: What they see of it.
+        lamp: The lamp.
+    """
+    return places.mixed(radiance((part,), 0, (lamp,), places.world, places.local, places.view, None))
+
+
+def _places(rays, edges, weights, origins, directions, sampling) -> Places:
+    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    k = min(sampling.colours, weights.shape[1])
+    _, chosen = jax.lax.top_k(weights, k)
+    t = jnp.take_along_axis(middle, chosen, axis=1)
+    return Places(
+        (origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3),
+        rays.at(t),
+        jnp.repeat(rays.direction, k, axis=0),
+        jnp.take_along_axis(weights, chosen, axis=1),
+        jnp.sum(weights, axis=1),
+    )
 
 
 def radiance(parts, i, lamps, world, local, view, ambient):

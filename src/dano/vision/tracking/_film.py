@@ -118,14 +118,20 @@ class Film(NamedTuple):
         reach = float(np.hypot(x, y).max())
         return bool(np.hypot(*found[:2]) + reach * np.hypot(*found[2:4]) < _UNMOVED)
 
-    def quiet(self, count: int) -> list[int]:
-        """Frames in which little moves, spread over the film, the quietest one first."""
+    def quiet(self, count: int, worse: Sequence[bool] | None = None) -> list[int]:
+        """Frames in which little moves, spread over the film, the quietest one first.
+
+        Args:
+            count: How many.
+            worse: Frames that count only where there is no other; default: none.
+        """
         small = np.stack([image[::4, ::4].mean(axis=2, dtype=np.float32) for image in self.images])
         # A camera's exposure is no motion.
         small = small / np.maximum(np.median(small, axis=(1, 2), keepdims=True), 1)
         change = np.abs(np.diff(small, axis=0)).mean(axis=(1, 2))
         change = np.maximum(np.append(change, 0), np.append(0, change))
-        parts = np.array_split(np.arange(len(change)), min(count, len(change)))
+        rows = np.arange(len(change)) if worse is None or all(worse) else np.flatnonzero(~np.array(worse))
+        parts = np.array_split(rows, min(count, len(rows)))
         return sorted((int(part[np.argmin(change[part])]) for part in parts), key=lambda i: change[i])
 
     def place(self, file: str | Path) -> Float[np.ndarray, "height width 3"]:

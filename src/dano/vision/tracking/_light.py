@@ -4,7 +4,6 @@ Shades on the object say roughly where the sun is, as far as the learned look is
 table says it to a degree or two: there the outline of the object is all that counts.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from dano.vision.capture import AbstractCamera, Light
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._placement import Placement
 from dano.vision.tracking._segments import OFTEN
-from dano.vision.tracking._subject import ROUGH, Subject
+from dano.vision.tracking._subject import ROUGH, Shown, Subject
 
 LAMPS = 3
 """Lamps that a film is lit by: a sun, a sky, and what a table throws back."""
@@ -122,7 +121,7 @@ class LightFit:
         self._keep = keep
         self._rows: list[np.ndarray] = []
         self._seen: list[np.ndarray] = []
-        self._views: list[tuple[Placement, AbstractCamera, np.ndarray]] = []
+        self._views: list[Shown] = []
         self._sun: np.ndarray | None = None
         self._places = even_directions(_DIRECTIONS)
 
@@ -152,9 +151,8 @@ class LightFit:
         if len(pixels) < 3 * _DIRECTIONS:
             return
         some = np.linspace(0, len(pixels) - 1, min(len(pixels), _MOST_PIXELS)).astype(int)
-        view = (place, camera, pixels[some])
-        places = self._places if self._subject.lit else self._places[:1]
-        rows = np.stack([self._column(view, towards) for towards in places], axis=-1)
+        view = self._subject.shown(place, camera, pixels[some])
+        rows = view.light(self._places if self._subject.lit else self._places[:1])
         self._views = [*self._views, view][-self._keep :]
         self._rows = [*self._rows, rows][-self._keep :]
         self._seen = [*self._seen, colours[some] ** GAMMA][-self._keep :]
@@ -198,7 +196,7 @@ class LightFit:
         around = np.stack([rows[..., above].mean(axis=-1), rows[..., ~above].mean(axis=-1)], axis=-1)
 
         def unlike(place: np.ndarray) -> float:
-            column = np.concatenate([self._column(view, place) for view in self._views])
+            column = self._column(place)
             total = 0.0
             for c in range(3):
                 mixed = np.concatenate([column[:, c, None], around[:, c]], axis=1)
@@ -209,21 +207,15 @@ class LightFit:
 
         return _best_direction(unlike, towards, _TURN, _TRIES)
 
-    def _column(self, view: tuple[Placement, AbstractCamera, np.ndarray], towards: np.ndarray) -> np.ndarray:
-        """Light that pixels of a frame get from a lamp of power one (n, 3)."""
-        place, camera, pixels = view
-        if place.drift is not None:
-            # Lamps are far: what is blurred is lit as it is in the middle of the exposure.
-            place = dataclasses.replace(place, drift=place.drift._replace(shutter=0.0))
-        dark = Light((0.0, 0.0, 1.0), intensity=0.0)
-        seen = self._subject.picture(place, (Light(towards), *[dark] * (LAMPS - 1)), camera, pixels)
-        return np.maximum(seen.colour / np.maximum(seen.opacity, 0.5)[:, None], 0) ** GAMMA
+    def _column(self, towards: np.ndarray) -> np.ndarray:
+        """Light that pixels of all frames get from a lamp of power one (n, 3)."""
+        return np.concatenate([view.light(towards[None])[..., 0] for view in self._views])
 
     def _fitted(self) -> tuple[Light, ...]:
         rows, seen, places = np.concatenate(self._rows), np.concatenate(self._seen), self._places
         first = []
         if self._sun is not None:
-            sun = np.concatenate([self._column(view, self._sun) for view in self._views])
+            sun = self._column(self._sun)
             others = places @ self._sun < _OTHER
             rows = np.concatenate([sun[..., None], rows[..., others]], axis=-1)
             places, first = np.concatenate([self._sun[None], places[others]]), [0]

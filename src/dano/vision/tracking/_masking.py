@@ -162,6 +162,16 @@ class Masking:
         mask = ndimage.binary_dilation(target.mask > 0.02, iterations=_SHADOW_GAP)
         light.add_shadow(place, target.camera, target.image, self._bare, ~mask & target.seen)
 
+    def cut(self, i: int) -> float:
+        """Share of the outline of a frame's mask that lies on the picture's edge; 0 without a mask."""
+        mask = self._alone(i)
+        if mask is None or not (mask > 0.5).any():
+            return 0.0
+        thing = np.pad(mask > 0.5, 1)
+        outline = ndimage.binary_dilation(thing) & ~thing
+        on_edge = outline.sum() - outline[1:-1, 1:-1].sum()
+        return float(on_edge / outline.sum())
+
     def hidden(self, i: int, window: tuple[slice, slice]) -> float:
         """Share of a window that something else hides."""
         return 1 - float(self._seen(i)[window].mean())

@@ -54,6 +54,9 @@ _WIDE, _WIDEST = 3.0, 0.15
 """How far the direction that a picture shows least is looked at: standard deviations, and at most [radii].
 Costs are flat over so much: in rendered films they have a tenth to a half of the curvature there."""
 
+_ALONG = (-1.0, -0.67, -0.33, 0.33, 0.67, 1.0)
+"""Shares of that at which other hollows of the cost are looked for."""
+
 _FLATTEST = 0.1
 """Least curvature there, over that of Gauss and Newton."""
 
@@ -222,6 +225,42 @@ def costs_of(
         return [np.inf] * len(places)
     index = np.unique(np.concatenate(shown), axis=0)
     return [_rows(subject, target, place, lamps, index, loss, slopes=False).cost for place in places]
+
+
+def beside(
+    subject: Subject,
+    target: Target,
+    found: Refined,
+    lamps: tuple[Light, ...],
+    others: Sequence[Placement],
+    *,
+    loss: str,
+    rays: int,
+    random: np.random.Generator,
+) -> Placement:
+    """The pose that a picture fits best of a found one, some others, and those along what it shows least.
+
+    Along the line of sight all that changes is the size, by a part of a pixel: what no longer fits at the rim
+    loses weight, and steps end in the nearest hollow of the cost.
+
+    Args:
+        subject: The object.
+        target: The picture.
+        found: What steps have led to.
+        lamps: Light.
+        others: Other poses near it.
+        loss: As in `TrackOptions`.
+        rays: Most pixels.
+        random: Which pixels are taken if there are more.
+    """
+    index = _chosen(subject, target, found.place, lamps, rays, random)
+    if index is None:
+        return found.place
+    move = _least_shown(found)
+    move *= _WIDEST / max(float(np.linalg.norm(move)), 1e-9)
+    places = [found.place, *(found.place.moved(share * move, subject.radius) for share in _ALONG), *others]
+    costs = [_rows(subject, target, place, lamps, index, loss, slopes=False).cost for place in places]
+    return places[int(np.argmin(costs))]
 
 
 def _least_shown(found: Refined) -> Float[np.ndarray, "6"]:

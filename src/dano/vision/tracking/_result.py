@@ -70,7 +70,8 @@ class Tracked(NamedTuple):
         covariance: Of each pose: of the position [m, W], then of the rotation vector [rad, object's frame],
             shape (T, 6, 6), with what all frames share because the learned object is beside the true one.
         own: The same without most of that, which `doubt` states.
-        status: Of each frame: "tracked", "lost", "outside" the picture, or "hidden".
+        status: Of each frame: "tracked", "lost", "outside" the picture (half of its surface or more),
+            or "hidden".
         quality: Overlap of each mask with the silhouette, as intersection over union, shape (T,).
         colour_error: Usual difference of colours of each frame, in sRGB, shape (T,).
         lamps: Light that the film is under.
@@ -180,7 +181,7 @@ def _messages(film: Film, status: Sequence[str], ambiguity: float) -> list[str]:
     texts = []
     for kind, words in (
         (LOST, "the object was lost (its mask does not fit the silhouette)"),
-        (OUTSIDE, "the object was out of the picture"),
+        (OUTSIDE, "the object was out of the picture, or so far that its pose is doubtful,"),
         (HIDDEN, "the object was hidden by more than half"),
     ):
         names = [n for n, s in zip(film.names, status, strict=True) if s == kind]

@@ -47,6 +47,9 @@ _ASIDE = np.radians(15)
 _DIFFERENT = np.radians(18)
 """Least angle between candidates."""
 
+_SHARES = (1.0, 0.85, 0.7, 0.55)
+"""Shares of a silhouette that may lie in the picture if the mask reaches its edge."""
+
 _COARSE = 26
 """Size of the object [pixels] at which candidates are refined."""
 
@@ -364,21 +367,53 @@ def _guesses(subject: Subject, target: Target, options: TrackOptions) -> list[_G
         return []
     y, x = np.mgrid[: target.mask.shape[0], : target.mask.shape[1]] + 0.5
     middle = np.array([(target.mask * x).sum(), (target.mask * y).sum()]) / area
-    root = np.sqrt(area)
     steps = np.linspace(-_REACH, _REACH, _GRID)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    at = (middle + root * grid - 0.5).T[::-1]
-    smooth = max(root * 2 * _REACH / _GRID / 2.5, 0.1)
-    mask = ndimage.map_coordinates(ndimage.gaussian_filter(target.mask, smooth), at, order=1)
-    image = _sampled(target.image, smooth, at)
+    samples = [_sample(target, *whole, grid) for whole in _wholes(target, middle, area)]
     guesses = []
     for axes in _views(options.views):
         opacity, colour, width = _view(subject, axes)
-        for turn, value, centre, size in _compared(opacity, colour, mask, image, grid, options):
-            place = _placed(subject, target, axes, turn, middle, root, centre * width, size * width)
-            guesses.append(_Guess(place, value))
+        for one in samples:
+            for turn, value, centre, size in _compared(opacity, colour, one, grid, options):
+                place = _placed(
+                    subject, target, axes, turn, one.middle, one.root, centre * width, size * width
+                )
+                guesses.append(_Guess(place, value))
     guesses.sort(key=lambda g: g.score)
     return distinct(guesses, lambda guess: guess.place, _DIFFERENT, 2 * options.candidates)
+
+
+def _wholes(
+    target: Target, middle: Float[np.ndarray, "2"], area: float
+) -> list[tuple[Float[np.ndarray, "2"], float]]:
+    """Middles and roots of areas that a silhouette may have of which a mask shows what is in the picture."""
+    thing = target.mask > 0.5
+    out = np.array([thing[:, -1].sum() - thing[:, 0].sum(), thing[-1].sum() - thing[0].sum()], float)
+    if not out.any():
+        return [(middle, float(np.sqrt(area)))]
+    out /= np.linalg.norm(out)
+    roots = [(share, np.sqrt(area / share)) for share in _SHARES]
+    # As if it were a square that the picture's edge cuts.
+    return [(middle + 0.5 * (1 - share) * root * out, float(root)) for share, root in roots]
+
+
+class _Sample(NamedTuple):
+    """A picture at the points of a grid around a silhouette."""
+
+    middle: Float[np.ndarray, "2"]
+    root: float  # Of its area
+    mask: Float[np.ndarray, " n"]
+    image: Float[np.ndarray, "n 3"]
+    within: Bool[np.ndarray, " n"]  # Points that lie in the picture: beside it all is unknown
+
+
+def _sample(target: Target, middle: Float[np.ndarray, "2"], root: float, grid: np.ndarray) -> _Sample:
+    at = (middle + root * grid - 0.5).T[::-1]
+    smooth = max(root * 2 * _REACH / _GRID / 2.5, 0.1)
+    mask = ndimage.map_coordinates(ndimage.gaussian_filter(target.mask, smooth), at, order=1)
+    size = np.array(target.mask.shape)[:, None]
+    within = np.all((at > -0.5) & (at < size - 0.5), axis=0)
+    return _Sample(middle, root, mask, _sampled(target.image, smooth, at), within)
 
 
 def _sampled(image: np.ndarray, smooth: float, at: np.ndarray) -> np.ndarray:
@@ -415,7 +450,7 @@ def _view(subject: Subject, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, f
     return seen.opacity.reshape(_SIDE, _SIDE), colour.reshape(_SIDE, _SIDE, 3), width
 
 
-def _compared(opacity, colour, mask, image, grid, options: TrackOptions):
+def _compared(opacity, colour, sample: _Sample, grid, options: TrackOptions):
     """The two best turns of a view, what they cost, and the middle and size of its silhouette."""
     y, x = np.mgrid[:_SIDE, :_SIDE] + 0.5 - 0.5 * _SIDE
     area = opacity.sum()
@@ -425,7 +460,8 @@ def _compared(opacity, colour, mask, image, grid, options: TrackOptions):
     c, s = np.cos(turns), np.sin(turns)
     turned = np.einsum("tij,nj->tni", np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1), grid)
     at = (centre + root * turned + 0.5 * _SIDE - 0.5).reshape(-1, 2).T[::-1]
-    shape = ndimage.map_coordinates(opacity, at, order=1).reshape(len(turns), -1)
+    mask, image = sample.mask, sample.image
+    shape = ndimage.map_coordinates(opacity, at, order=1).reshape(len(turns), -1) * sample.within
     both = np.minimum(shape, mask).sum(axis=1)
     costs = 3 * (1 - both / np.maximum(shape, mask).sum(axis=1))
     if options.loss == "photometric":

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate, quat_to_matrix
 from dano.vision.capture import AbstractCamera, Light, PosedCamera
-from dano.vision.drawing import GAMMA, Part, through
+from dano.vision.drawing import colours_under, GAMMA, Part, Places, places_seen, through
 from dano.vision.radiance import LearnedField, Sampling, SurfaceModel
 from dano.vision.tracking._placement import Drift, Placement
 from dano.vision.trajectory import crossings, Solid, solid_of
@@ -33,6 +33,12 @@ _SOFT = 3.0
 
 BAND = 4
 """Pixels on each side of an edge that take part in what pictures say."""
+
+_KEPT = 4
+"""Whole pictures that are kept: of the poses that a frame is looked at."""
+
+_SURFACE = 1000
+"""Points that stand for the surface, about: a share of them is known to two percent."""
 
 _NEARLY = 0.02, np.radians(2)
 """Share of the size, and angle, by which a pose may be beside the one that other frames lead to."""
@@ -93,7 +99,7 @@ class Subject:
         self._model = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), field.model)
         self._field = field
         self._drawn = float(field.drawn_sharpness)
-        self._last: tuple[tuple, np.ndarray, np.ndarray] | None = None
+        self._whole: list[tuple[tuple, np.ndarray, np.ndarray]] = []
         self._slopes: dict[bytes, np.ndarray] = {}
 
     @functools.cached_property
@@ -121,6 +127,20 @@ class Subject:
     def around(self, middle: Float[np.ndarray, "3"], orientation: Float[np.ndarray, "4"]) -> Placement:
         """The placement with an orientation whose ball lies around a point [m, W]."""
         return Placement(middle - quat_to_matrix(orientation) @ self.centre, orientation)
+
+    def inside(self, place: Placement, camera: AbstractCamera) -> float:
+        """Share of the points of its surface that lie within a picture, whether or not it shows them."""
+        points = place.position + self._surface @ quat_to_matrix(place.orientation).T
+        x, y, ahead = camera.project(points).T
+        within = (ahead > 0) & (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+        return float(within.mean())
+
+    @functools.cached_property
+    def _surface(self) -> Float[np.ndarray, "n 3"]:
+        """Points all over the surface [m, F]."""
+        values, box = np.asarray(self._field.model.distances), self._field.model.box
+        points = box.origin + box.spacing * crossings(values)
+        return points[:: len(points) // _SURFACE + 1]
 
     def pixel(self, place: Placement, camera: AbstractCamera) -> float:
         """What one pixel of a camera covers at the middle [m]."""
@@ -174,9 +194,7 @@ class Subject:
             pixel: Angle between neighbouring rays [rad].
             slopes: Whether derivatives are wanted.
         """
-        away = max(float(np.linalg.norm(self.middle(place) - origins[0])), self.radius)
-        sharpness = min(self._drawn, _STEEPEST / (pixel * away))
-        n = len(directions)
+        sharpness, n = self._sharpness(place, origins, pixel), len(directions)
         rows = [np.zeros((0,)), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3, 6))]
         parts = [rows]
         for rays in _chunks(n):
@@ -186,6 +204,31 @@ class Subject:
                 [np.asarray(x, np.float64)[: len(origins[rays])] for x in found] + rows[len(found) :]
             )
         return Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def shown(self, place: Placement, camera: AbstractCamera, pixels: Float[np.ndarray, "n 2"]) -> "Shown":
+        """What pixels show of the object under whatever light; if it moves, in the middle of their exposure.
+
+        Args:
+            place: Where the object is, and how it moves.
+            camera: From where.
+            pixels: Image coordinates of the middles of pixels.
+        """
+        directions = self._directions(camera, pixels)
+        origins = np.broadcast_to(camera.position, directions.shape)
+        if place.drift is not None:
+            late = place.drift._replace(shutter=0.0).moments(pixels[:, 1] / camera.height, 0.0)[:, 0]
+            origins, directions = self._meanwhile(place, place.drift, late, origins, directions)
+        sharpness = self._sharpness(place, origins, camera.pixel_angle)
+        parts = []
+        for rays in _chunks(len(directions)):
+            looking = self._looking(place, (), sharpness, origins[rays], directions[rays])
+            parts.append((looking, _places(looking), len(origins[rays])))
+        return Shown(tuple(parts))
+
+    def _sharpness(self, place: Placement, origins: Float[np.ndarray, "n 3"], pixel: float) -> float:
+        """Of the surface, as a pixel of some angle [rad] sees it."""
+        away = max(float(np.linalg.norm(self.middle(place) - origins[0])), self.radius)
+        return min(self._drawn, _STEEPEST / (pixel * away))
 
     def _looking(
         self,
@@ -277,7 +320,8 @@ class Subject:
             pattern: Whether each pixel inside the object counts, not only its edge and how bright parts are.
         """
         asked = (place, lamps, camera, pattern)
-        if self._last is None or any(a is not b for a, b in zip(self._last[0], asked, strict=True)):
+        known = [one for one in self._whole if all(a is b for a, b in zip(one[0], asked, strict=True))]
+        if not known:
             both = np.zeros((camera.height, camera.width, 4))
             window = window_of(self, place, camera, _WIDE)
             pixels = np.zeros((0, 2)) if window is None else pixels_of(window)
@@ -293,8 +337,9 @@ class Subject:
                 both[y, x] = _sparsely(values, pixels) if sparse else values(pixels)
                 if place.drift is not None:
                     both[y, x] = self._spread(place, place.drift, camera, pixels, both)
-            self._last = asked, both[..., 0], both[..., 1:]
-        return self._last[1:]
+            known = [(asked, both[..., 0], both[..., 1:])]
+            self._whole = [*self._whole, *known][-_KEPT:]
+        return known[0][1:]
 
     def _directions(
         self, camera: AbstractCamera, pixels: Float[np.ndarray, "n 2"]
@@ -453,14 +498,51 @@ class _Looking(NamedTuple):
 
     def moved(self, change: Array) -> tuple[Array, Array, Array]:
         """Opacity, colour and mean distance times opacity after a change of the pose (`Placement.moved`)."""
-        turned = quat_multiply(self.orientation, quat_exp(change[3:]))
-        place = self.position + self.radius * change[:3]
-        part = Part(self.model, quat_to_matrix(turned), place, jnp.asarray(self.sharpness))
+        part = self.part(change)
         limit = jnp.full(len(self.directions), jnp.inf, jnp.float32)
         colour, away, (opacity,), _ = through(
             (part,), (self.lamps,), self.origins, self.directions, limit, 0.0, SAMPLING
         )
         return opacity, colour, away
+
+    def part(self, change: Array) -> Part:
+        """The model after a change of the pose."""
+        turned = quat_multiply(self.orientation, quat_exp(change[3:]))
+        place = self.position + self.radius * change[:3]
+        return Part(self.model, quat_to_matrix(turned), place, jnp.asarray(self.sharpness))
+
+
+class Shown(NamedTuple):
+    """What pixels show of an object, of which light changes only the colours."""
+
+    parts: tuple[tuple[_Looking, Places, int], ...]  # Chunks of rays, and how many of each count
+
+    def light(self, towards: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "n 3 k"]:
+        """Linear light that pixels get from far lamps of power one in some unit directions [W]."""
+        lamp, towards = Light((0.0, 0.0, 1.0)), towards.astype(np.float32)
+        rows = []
+        for looking, places, n in self.parts:
+            rows.append(np.asarray(_lit(looking, places, lamp, towards), np.float64)[:, :n])
+        return np.moveaxis(np.concatenate(rows, axis=1), 0, -1)
+
+
+@eqx.filter_jit
+def _places(looking: _Looking) -> Places:
+    still = jnp.zeros(6, jnp.float32)
+    return places_seen(looking.part(still), looking.origins, looking.directions, SAMPLING)
+
+
+@eqx.filter_jit
+def _lit(
+    looking: _Looking, places: Places, lamp: Light, towards: Float[Array, "k 3"]
+) -> Float[Array, "k n 3"]:
+    part = looking.part(jnp.zeros(6, jnp.float32))
+
+    def light(place: Array) -> Array:
+        colour = colours_under(part, places, eqx.tree_at(lambda one: one.place, lamp, place))
+        return jnp.maximum(colour / jnp.maximum(places.opacity, 0.5)[:, None], 0) ** GAMMA
+
+    return jax.vmap(light)(towards)
 
 
 @eqx.filter_jit

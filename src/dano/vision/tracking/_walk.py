@@ -36,6 +36,9 @@ from dano.vision.tracking._whole import region_of, turned, Whole
 _STEPS = 4
 """Steps of a refinement, most."""
 
+_MOSTLY_OUT = 0.25
+"""Share of an object's surface that must be expected within the picture for a frame to be looked at."""
+
 _SHARP = 0.7
 """Difference of ways during an exposure that hardly shows [pixels]."""
 
@@ -63,6 +66,13 @@ _TRIED = 3
 
 _CONVINCING = 0.45
 """Score of a start from which no other frame is tried: an overlap of 0.93, and colours within 0.05."""
+
+_AS_GOOD = 1.5
+"""Ratio of the scores of coarse starts up to which the worse one may be the right one."""
+
+_CUT = 0.02
+"""Share of a mask's outline on the picture's edge from which the object may go on beyond it: then neither
+its middle nor its size is that of the mask."""
 
 _CAUGHT = 0.4
 """Overlap with a thing from which it may be the object, turned meanwhile."""
@@ -114,7 +124,9 @@ class Walk:
             self._masking.knows(self._colours)
         if self._given is not None or self._masking.source != "object":
             return 0
-        for i in self._film.quiet(_TRIED):
+        cuts = [self._masking.cut(i) for i in range(len(self._found))]
+        most = max(_CUT, 1.1 * min(cuts))
+        for i in self._film.quiet(_TRIED, [cut > most for cut in cuts]):
             found = self._starts(i)
             if found and (self._begun is None or found[0][0].score < self._begun[1][0][0].score):
                 self._begun = i, found
@@ -274,7 +286,7 @@ class Walk:
         found, status = self._followed(i, expected)
         # The coarse levels see further, but what is hidden in part may lead them away.
         near = self._fine(i, expected, self._light) if status in (TRACKED, LOST) else None
-        if near is not None and not self._is_it(near):
+        if near is not None and (not self._is_it(near) or self._is_cut_off(near)):
             near = None
         poses = [one for one in (self._found[i], found, near) if one is not None]
         if not poses:
@@ -323,7 +335,7 @@ class Walk:
         if not found:
             return None
         best, ambiguity = found[0]
-        if not self._is_it(best.refined):
+        if not self._is_it(best.refined) or self._is_cut_off(best.refined):
             # A hand before it may have left little of it to see.
             return None
         if not self._light.known:
@@ -354,7 +366,8 @@ class Walk:
     def _searched_in(self, i: int, target: Target) -> tuple[Start, float] | None:
         """The likeliest start for one thing that a frame shows, and how clearly it is."""
         starts = search(self._subject, target, self._options, self._random)
-        # At low resolution a wrong pose may look as good as the right one, so all are finished.
+        # At low resolution a wrong pose may look as good as the right one: all that do are finished.
+        starts = [start for start in starts if start.score < _AS_GOOD * starts[0].score]
         finished = [self._finished(i, start.refined.place, start.light) for start in starts]
         finer = sorted((s for s in finished if s is not None), key=lambda s: s.score)
         if not finer or finer[0].refined.overlap < _FOUND:
@@ -401,12 +414,20 @@ class Walk:
             0 <= middle[0] <= self._camera.width and 0 <= middle[1] <= self._camera.height
         ):
             return None, OUTSIDE
+        if self._subject.inside(before, self._camera) < _MOSTLY_OUT:
+            return None, OUTSIDE
         if self._masking.hidden(i, window) > 1 - BLIND:
             return None, HIDDEN
         found = self._refined(i, before, self._light)
         if found is None or not self._is_it(found):
             return None, LOST
+        if self._is_cut_off(found):
+            return None, OUTSIDE
         return found, TRACKED
+
+    def _is_cut_off(self, found: Refined) -> bool:
+        """Whether so little of the object is in the picture that its pose is doubtful."""
+        return self._subject.inside(found.place, self._camera) < BLIND
 
     def _is_it(self, found: Refined) -> bool:
         """Whether shape and colours are the object's, and fit not much worse than in the other frames."""

@@ -14,7 +14,7 @@ from dano.vision.tracking._light import LightFit
 from dano.vision.tracking._masking import Masking
 from dano.vision.tracking._options import TrackOptions
 from dano.vision.tracking._placement import Drift, Placement
-from dano.vision.tracking._refine import costs_of, linearized, refine, Refined, silhouette, window_of
+from dano.vision.tracking._refine import beside, costs_of, linearized, refine, Refined, silhouette, window_of
 from dano.vision.tracking._result import own_covariance, SCALE_DOUBT
 from dano.vision.tracking._search import ALIKE, half_turns, learn_light, pattern
 from dano.vision.tracking._segments import overlap
@@ -131,31 +131,18 @@ class Whole:
         target = masking.near(i, self._subject, place, light.lamps, self._camera, 2.0)
         if target is None:
             return before
-        levels = [(target, _FINE_STEPS)]
+        how = {"loss": self._options.loss, "rays": 2 * ROUGH, "random": random}
+        found = before
         if self._subject.pixels(place, self._camera) > _SMALLEST:
-            levels = [(target.reduced(2), _COARSE_STEPS), *levels]
-        found = None
-        for level, steps in levels:
-            found = refine(
-                self._subject,
-                level,
-                place,
-                light.lamps,
-                loss=self._options.loss,
-                steps=steps,
-                rays=2 * ROUGH,
-                random=random,
-            )
-            if found is None:
-                return before
-            place = found.place
-        places = [before.place, place]
-        if self._subject.off(*places) < 1:
-            # The motion of all frames says more than such a difference.
-            return before
-        costs = costs_of(
-            self._subject, target, places, light.lamps, loss=self._options.loss, rays=ROUGH, random=random
-        )
+            coarse = target.reduced(2)
+            found = refine(self._subject, coarse, place, light.lamps, steps=_COARSE_STEPS, **how) or before
+        others = [before.place, self._place(i)]
+        best = beside(self._subject, target, found, light.lamps, others, **how)
+        found = refine(self._subject, target, best, light.lamps, steps=_FINE_STEPS, **how)
+        if found is None or best is before.place:
+            return found or before
+        places = [before.place, found.place]
+        costs = costs_of(self._subject, target, places, light.lamps, **how)
         return found if costs[1] < costs[0] else before
 
     def _looked_at(

@@ -12,7 +12,7 @@ samples depend on is a structure by value, whose derivatives are summed before t
 
 import warp as wp
 
-from dano.engine.kernels.impacts import support_before, support_delayed
+from dano.engine.kernels.impacts import end_of_step, support_before, support_on_way
 from dano.engine.kernels.tables import Body, FoundPair, Given, StateRow
 from dano.physics.features import TREES
 from dano.physics.friction import friction_near, Slip
@@ -33,7 +33,7 @@ from dano.physics.impacts import (
     supported,
     turning_after,
 )
-from dano.physics.momentum import angular_momentum, end_of_impact, gyroscopic_gain, turned_inertia
+from dano.physics.momentum import angular_momentum, gyroscopic_gain, turned_inertia
 from dano.physics.pairs import (
     BodyState,
     centres_apart,
@@ -42,12 +42,13 @@ from dano.physics.pairs import (
     PairPose,
     position_after,
     rotation_after,
+    rotation_met,
     seen_from,
     shrunk,
 )
 from dano.physics.point_law import friction_bound, Material, point_law, point_motion, traction
 from dano.physics.real import HALF, mat33, ONE, real, vec3, vec6, ZERO
-from dano.physics.rotations import from_wxyz, interpolated, matrix, to_wxyz, turned
+from dano.physics.rotations import from_wxyz, matrix, turned
 from dano.physics.samples import point_contact, position_in_solid, Sample
 from dano.physics.solids.distances import leaf_distance, Solid
 from dano.physics.solids.leaves import Distance, Solids
@@ -62,18 +63,22 @@ _PRESSES, _MEETS = wp.constant(PRESSES), wp.constant(MEETS)
 
 @wp.struct
 class Virtual:
-    """Twists of the bodies of a pair [W]: at the end of the step, and virtual ones.
-
-    The last two are those of impulses that take effect after the share τ of the step: τ times them is taken
-    off.
-    """
+    """Twists of the bodies of a pair [W]: at the end of the step, and virtual ones."""
 
     first: vec6
     second: vec6
     first_virtual: vec6
     second_virtual: vec6
-    first_late: vec6
-    second_late: vec6
+
+
+@wp.struct
+class Waiting:
+    """A pair's part of derivatives by what its bodies wait for: see `BodyState`."""
+
+    met: real
+    lead: real
+    first_support: vec6
+    second_support: vec6
 
 
 @wp.struct
@@ -113,6 +118,7 @@ class Asked:
 
 patch_product, rest_product = product_of(Patch), product_of(Rest)
 impact_product, body_product = product_of(Impact), product_of(BodyState)
+row_product = product_of(StateRow)
 distance_work = vjp_of(leaf_distance)
 
 
@@ -136,16 +142,13 @@ def sample_work(
         apart = at.pose.com_difference
         twist = relative_twist(twists.first, twists.second, apart)
         virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
-        late = relative_twist(twists.first_late, twists.second_late, apart)
-        along = virtual.velocity - (at.impact.delays * at.share) * late.velocity
-        turn = virtual.spin - (at.impact.delays * at.share) * late.spin
         motion = point_motion(point, twist.velocity, twist.spin)
         found = traction(law, motion.rate, motion.slip + law.extra_slip)
         if slip.is_gradual:
             bound = friction_bound(law, found.pressure)
             found.friction = friction_near(motion.slip + law.extra_slip, bound.value, slip)
-        by_pressure = wp.dot(point.normal, along) + wp.dot(point.moment, turn)
-        by_friction = wp.dot(found.friction, along + wp.cross(turn, point.arm))
+        by_pressure = wp.dot(point.normal, virtual.velocity) + wp.dot(point.moment, virtual.spin)
+        by_friction = wp.dot(found.friction, virtual.velocity + wp.cross(virtual.spin, point.arm))
         return h * point.area * (found.pressure * by_pressure + by_friction)
     bounce = at.material.bounce
     if what == _MEETS:
@@ -169,9 +172,9 @@ pose_work = vjp_of(pose_of)
 
 
 @wp.func
-def apart_of(at: MetPair, first_until: real, second_until: real) -> vec3:
-    """Way between the centres of mass, where impulses take effect after shares of the step [m, W]."""
-    return centres_apart(at.first, at.second, first_until, second_until, at.timestep)
+def apart_of(at: MetPair) -> vec3:
+    """Way between the centres of mass, each where impulses on it take effect [m, W]."""
+    return centres_apart(at.first, at.second, at.timestep)
 
 
 apart_work = vjp_of(apart_of)
@@ -221,29 +224,22 @@ def gain_of_row(body: Body, row: StateRow, h: real) -> vec3:
 
 
 @wp.func
-def rotation_of(body: Body, row: StateRow, met: real, h: real) -> mat33:
-    """`rotation_met` of a body's row at the start of a step."""
-    q = from_wxyz(row.orientation)
-    if met != ZERO:
-        return matrix(interpolated(q, turned(q, row.omega + gain_of_row(body, row, h), h), met))
-    return matrix(q)
-
-
-@wp.func
 def momentum_gained(
-    given: Given, world: int, i: int, row: StateRow, met: real, lead: real, velocity: vec6
+    given: Given, world: int, i: int, row: StateRow, balanced: mat33, lead: real, velocity: vec6
 ) -> vec6:
-    """What a body's momentum gains in a step beyond gravity and control, times −1 [kg m/s; kg m²/s, W]."""
+    """What a body's momentum gains in a step beyond gravity and control, times −1 [kg m/s; kg m²/s, W].
+
+    `balanced` is the rotation of the body when its angular momentum is balanced.
+    """
     body = given.bodies[world, i]
     push = given.pushes[world, i]
     h = given.timestep[world, 0]
     rotation = matrix(from_wxyz(row.orientation))
     comes = row.velocity + h * given.gravity[world, 0]
     linear = body.mass * (comes - linear_part(velocity)) + h * push.force
-    inertia = turned_inertia(rotation, body.inertia)
-    before = angular_momentum(rotation * row.omega, inertia, h, -ONE) + h * push.torque
-    inertia_met = turned_inertia(rotation_of(body, row, met, h), body.inertia)
-    return joined(linear, before - angular_momentum(angular_part(velocity), inertia_met, h, lead))
+    before = angular_momentum(rotation * row.omega, turned_inertia(rotation, body.inertia), h, -ONE)
+    after = angular_momentum(angular_part(velocity), turned_inertia(balanced, body.inertia), h, lead)
+    return joined(linear, before + h * push.torque - after)
 
 
 @wp.func
@@ -251,7 +247,10 @@ def momentum_work(given: Given, world: int, i: int, velocity: vec6, virtual: vec
     """Work of what a body's momentum gains beyond gravity and control, along minus its virtual velocity."""
     state = given.seen[world, i]
     row = given.state[world, i]
-    return wp.dot(momentum_gained(given, world, i, row, state.met, state.lead, velocity), virtual)
+    balanced = matrix(from_wxyz(row.orientation))
+    if state.met != ZERO:
+        balanced = rotation_met(state)
+    return wp.dot(momentum_gained(given, world, i, row, balanced, state.lead, velocity), virtual)
 
 
 @wp.func
@@ -275,49 +274,22 @@ def state_work(given: Given, world: int, i: int, moves: bool, bar: BodyState) ->
                 bar.spin_gain + (HALF * h) * bar.lag, matrix(q) * gain
             )
             total += bar.inverse_mass / body.mass + wp.ddot(bar.inverse_inertia, wp.inverse(inertia))
+            push = given.pushes[world, i]
+            total += h * wp.dot(bar.support, joined(push.force, push.torque))
     return total + wp.dot(bar.ahead, ahead) + wp.dot(bar.ahead_falling, ahead_falling)
 
 
 @wp.func
-def advance_work(
-    given: Given,
-    world: int,
-    i: int,
-    velocity: vec6,
-    moved: vec6,
-    bar: StateRow,
-) -> real:
-    """⟨bar, state of a body at the end of a step⟩; `moved` is the twist by which its pose changes."""
-    body = given.bodies[world, i]
-    row = given.state[world, i]
-    h = given.timestep[world, 0]
-    state = given.seen[world, i]
-    q = from_wxyz(row.orientation)
-    back = wp.transpose(matrix(q))
-    turn = angular_part(moved)
-    omega = back * angular_part(velocity)
-    if state.lead < ONE:
-        gain = matrix(q) * gain_of_row(body, row, h)
-        met = rotation_of(body, row, state.met, h)
-        end = end_of_impact(angular_part(velocity), body.inertia, met, gain, h, state.met, state.lead)
-        omega = end.omega
-        turn = turn + end.turn
-    return (
-        wp.dot(bar.position, row.position + h * linear_part(moved))
-        + wp.dot(bar.orientation, to_wxyz(turned(q, back * turn, h)))
-        + wp.dot(bar.velocity, linear_part(velocity))
-        + wp.dot(bar.omega, omega)
+def advance_work(given: Given, world: int, i: int, velocity: vec6, bar: StateRow) -> real:
+    """⟨bar, state of a body at the end of a step⟩."""
+    end = end_of_step(
+        given.state[world, i],
+        given.seen[world, i],
+        given.bodies[world, i].inertia,
+        velocity,
+        given.timestep[world, 0],
     )
-
-
-@wp.func
-def late_work(given: Given, world: int, i: int, lost: vec6, late: vec6) -> real:
-    """Work of the momentum of a twist along another: μᵀ M D."""
-    body = given.bodies[world, i]
-    rotation = rotation_of(body, given.state[world, i], given.seen[world, i].met, given.timestep[world, 0])
-    along = wp.dot(linear_part(late), linear_part(lost))
-    turned_back = turned_inertia(rotation, body.inertia) * angular_part(lost)
-    return body.mass * along + wp.dot(angular_part(late), turned_back)
+    return row_product(bar, end)
 
 
 @wp.func
@@ -349,17 +321,17 @@ def impact_work(
 
 
 @wp.func
-def waiting_work(found: FoundPair, apart: vec3, twists: Virtual, met: real, lead: real) -> real:
+def waiting_work(found: FoundPair, apart: vec3, twists: Virtual, waiting: Waiting) -> real:
     """What an impulse that waits until its bodies meet makes of the equations besides its own work.
 
-    That is the work of what they rest on until then, and ⟨bars, when angular momentum is balanced⟩; `apart`
-    is from the second centre of mass to the first when the step begins [m, W].
+    That is the work of what they rest on until then, ⟨bars, their way meanwhile⟩ and ⟨bars, when angular
+    momentum is balanced⟩; `apart` is from the second centre of mass to the first when the step begins [m, W].
     """
-    at_once = relative_twist(twists.first_virtual, twists.second_virtual, apart)
-    late = relative_twist(twists.first_late, twists.second_late, apart)
-    work = wp.dot(support_before(found), joined(at_once.velocity, at_once.spin))
-    work -= wp.dot(support_delayed(found), joined(late.velocity, late.spin))
-    return work + found.impact.delays * (met * found.share - lead)
+    virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
+    carried = relative_twist(waiting.first_support, waiting.second_support, apart)
+    work = wp.dot(support_before(found), joined(virtual.velocity, virtual.spin))
+    work += wp.dot(support_on_way(found), joined(carried.velocity, carried.spin))
+    return work + found.impact.delays * (waiting.met * found.share - waiting.lead)
 
 
 @wp.func
@@ -393,6 +365,6 @@ def fall_work(at: MetPair, depth: real, bar: real) -> real:
 
 for _function in (
     sample_work, distance_work, pose_work, apart_work, critical_work, facing_work, momentum_work, state_work,
-    advance_work, late_work, impact_work, waiting_work, support_work, fall_work,
+    advance_work, impact_work, waiting_work, support_work, fall_work,
 ):  # fmt: skip
     need_adjoints(_function)

@@ -21,6 +21,7 @@ from dano.engine.kernels.derivatives.adjoint import (
     support_work,
     Touching,
     Virtual,
+    Waiting,
     waiting_work,
 )
 from dano.engine.kernels.impacts import apart_at_start
@@ -28,10 +29,8 @@ from dano.engine.kernels.lanes import total, total_of
 from dano.engine.kernels.near import (
     as_they_meet,
     facing,
-    first_until,
     left_out,
     posed,
-    second_until,
     solid_of_body,
 )
 from dano.engine.kernels.tables import FoundPair, numbers_of, Room, Scene
@@ -298,8 +297,8 @@ def pull_support(
     pair = numbers_of(scene, world, found.pair)
     turning = scene.body_index[index.first].turning
     h = scene.timestep[world, 0]
-    a = falling(room.bodies[world, index.first], found.falls)
-    b = falling(room.bodies[world, index.second], found.falls)
+    a = falling(room.bodies[world, index.first], found.first_falls)
+    b = falling(room.bodies[world, index.second], found.second_falls)
     toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
     at = met_pair(scene, world, found, a, b, ZERO, toward)
     samples = Touching()
@@ -378,13 +377,11 @@ def pull_pair(
     found: FoundPair,
     rebound: real,
     twists: Virtual,
-    met_bar: real,
-    lead_bar: real,
+    waiting: Waiting,
 ) -> tuple[MetPair, Virtual]:
     """Derivatives by a pair's bodies, for the first lane, and by twists; adds those by all else.
 
-    `rebound` is the share of the restitution that counts; the bars are the pair's part of those by when the
-    angular momentum of its bodies is balanced.
+    `rebound` is the share of the restitution that counts.
     """
     index = scene.pair_index[found.pair]
     pair = numbers_of(scene, world, found.pair)
@@ -404,12 +401,7 @@ def pull_pair(
     by.material.restitution = restores * by.material.restitution
     by.rests = by.impact.rests
     factor_bar = by.impact.factor
-    bar, by_first_until, by_second_until, _j = wp.grad(apart_work)(
-        at, first_until(found), second_until(found), by.pose.com_difference
-    )
-    by_until = real(found.first_waits) * by_first_until + real(found.second_waits) * by_second_until
-    by.impact.delays += found.share * by_until
-    by.share += found.impact.delays * by_until
+    bar, _j = wp.grad(apart_work)(at, by.pose.com_difference)
     support_bar = vec6()
     if found.impact.share > ZERO:
         hits = found.impact.stiffness > ZERO
@@ -417,10 +409,13 @@ def pull_pair(
         if wp.static(not TREES):
             alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
             if hits:
+                # Those by when its own impulses take effect are known by now.
+                own = waiting
+                own.met += real(found.first_waits) * bar.first.met + real(found.second_waits) * bar.second.met
+                bar.first.met = ZERO
+                bar.second.met = ZERO
                 apart = apart_at_start(scene, room, world, found)
-                by_found, by_apart, _a, _b, _c = wp.grad(waiting_work)(
-                    found, apart, twists, met_bar, lead_bar
-                )
+                by_found, by_apart, _a, _b = wp.grad(waiting_work)(found, apart, twists, own)
                 by.impact.delays += by_found.impact.delays
                 by.share += by_found.share
                 support_bar = by_found.support
@@ -453,6 +448,6 @@ def pull_pair(
         if wp.length_sq(found.support) > ZERO:
             bar = pull_support(scene, room, world, lane, found, support_bar, by.rests, depth_bar, bar)
     if lane == 0:
-        bar.first = falling_bar(bar.first, found.falls)
-        bar.second = falling_bar(bar.second, found.falls)
+        bar.first = falling_bar(bar.first, found.first_falls)
+        bar.second = falling_bar(bar.second, found.second_falls)
     return bar, by_twists

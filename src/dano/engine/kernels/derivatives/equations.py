@@ -2,14 +2,14 @@
 
 import warp as wp
 
-from dano.engine.kernels.assembly import row_of, twist_of
+from dano.engine.kernels.assembly import twist_of
 from dano.engine.kernels.derivatives.adjoint import (
     advance_work,
-    late_work,
     MetPair,
     momentum_work,
     state_work,
     Virtual,
+    Waiting,
 )
 from dano.engine.kernels.derivatives.contact import add_to_state, pull_pair
 from dano.engine.kernels.derivatives.patches import pull_patch
@@ -24,7 +24,6 @@ from dano.engine.kernels.derivatives.trees import (
     pull_places,
     transpose_entries,
 )
-from dano.engine.kernels.impacts import freed, meetings_of, pair_slope
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_blocks, copy_transposed_blocks, EVERYWHERE, solve_blocks
 from dano.engine.kernels.rollout import Launch, push_of, row_before
@@ -33,12 +32,12 @@ from dano.engine.kernels.tables import FoundPair, Room, Scene, StateRow
 from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals, solve_trees
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.pairs import BodyState
-from dano.physics.real import ONE, real, vec6, ZERO
+from dano.physics.real import ONE, vec6, ZERO
 from dano.physics.structures import after_adjoints, product_of
-from dano.physics.twists import shift
 
 _LANES = wp.constant(LANES)
 body_product, row_product = product_of(BodyState), product_of(StateRow)
+waiting_product = product_of(Waiting)
 
 
 @wp.func
@@ -68,55 +67,11 @@ def pull_advance(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, a
         return
     b = block_of(scene, m)
     room.residual[world, b] = vec6()
-    room.late[world, b] = vec6()
     if not (row_product(after, after) == ZERO):
-        _a, _b, _c, by_velocity, by_moved, _e = wp.grad(advance_work)(
-            room.given, world, i, room.velocity[world, b], room.moved[world, b], after
+        _a, _b, _c, by_velocity, _e = wp.grad(advance_work)(
+            room.given, world, i, room.velocity[world, b], after
         )
-        room.residual[world, b] = by_velocity + by_moved
-        if wp.static(not TREES):
-            room.late[world, b] = freed(room, world, i, m, by_moved)
-
-
-@wp.func
-def subtract_slope(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, found: FoundPair):
-    """Take what the delayed impulse of a pair makes of positions by its velocities off their derivatives."""
-    slope = pair_slope(scene, room, world, found)
-    if lane == 0:
-        index = scene.pair_index[found.pair]
-        a = scene.body_index[index.first].row
-        b = scene.body_index[index.second].row
-        t = shift(found.com_difference)
-        late = vec6()
-        if found.first_waits > 0:
-            late = room.late[world, a]
-        if found.second_waits > 0:
-            late = late - t * room.late[world, b]
-        by_twist = (found.impact.delays * found.share) * (wp.transpose(slope) * late)
-        if a >= 0:
-            room.residual[world, a] -= by_twist
-        if b >= 0:
-            room.residual[world, b] += wp.transpose(t) * by_twist
-
-
-@after_adjoints
-@wp.func
-def pull_delays(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Derivatives by velocities and by masses through impulses that take effect within the step."""
-    for f in range(n_found):
-        if room.found[world, f * _LANES + lane].impact.delays > ZERO:
-            subtract_slope(scene, room, world, lane, room.found[world, f * _LANES + lane])
-    wait()
-    if lane == 0:
-        for b in range(scene.n_blocks):
-            lost = room.velocity[world, b] - room.moved[world, b]
-            if wp.length_sq(lost) > ZERO:
-                _a, _b, _c, _d, _e = wp.grad(late_work)(
-                    room.given, world, scene.moving[b], lost, room.late[world, b]
-                )
-
-
-_LANES = wp.constant(LANES)
+        room.residual[world, b] = by_velocity
 
 
 @wp.func
@@ -199,7 +154,6 @@ def pull_end(
     world: int,
     lane: int,
     t: int,
-    n_found: int,
 ):
     """Derivatives by what a step begins with, and by its velocities, from those by its end.
 
@@ -220,9 +174,6 @@ def pull_end(
             pull_coordinates(scene, room, world)
             pull_chains(scene, room, world)
     wait()
-    if wp.static(not TREES):
-        pull_delays(scene, room, world, lane, n_found)
-        wait()
 
 
 @wp.func
@@ -236,39 +187,34 @@ def twists_of_pair(scene: wp.ref[Scene], room: wp.ref[Room], world: int, entry: 
     twists.second = twist_of(scene, room, world, second, room.velocity, ONE)
     twists.first_virtual = twist_of(scene, room, world, first, room.step, ZERO)
     twists.second_virtual = twist_of(scene, room, world, second, room.step, ZERO)
-    if wp.static(not TREES):
-        if room.found[world, entry].first_waits > 0:
-            twists.first_late = row_of(room.late, world, first)
-        if room.found[world, entry].second_waits > 0:
-            twists.second_late = row_of(room.late, world, second)
     return twists
 
 
 @wp.func
 def is_moved_pair(twists: Virtual) -> bool:
     """Whether virtual velocities of a pair are not zero; what is not a number is not."""
-    size = wp.length_sq(twists.first_virtual) + wp.length_sq(twists.second_virtual)
-    return not (size + wp.length_sq(twists.first_late) + wp.length_sq(twists.second_late) == ZERO)
+    return not (wp.length_sq(twists.first_virtual) + wp.length_sq(twists.second_virtual) == ZERO)
 
 
 @wp.func
-def balance_bars(scene: wp.ref[Scene], room: wp.ref[Room], world: int, entry: int) -> tuple[real, real]:
-    """A pair's part of derivatives by when the angular momenta of its bodies are balanced."""
-    met = real(0.0)
-    lead = real(0.0)
+def waiting_bars(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> Waiting:
+    """A pair's part of derivatives by when impulses on its bodies take effect, and by what carries them."""
+    bars = Waiting()
     if wp.static(not TREES):
-        found = room.found[world, entry]
-        side = int(0)
-        while side < 2:
-            body = wp.where(
-                side == 0, scene.pair_index[found.pair].first, scene.pair_index[found.pair].second
-            )
-            if wp.where(side == 0, found.first_waits, found.second_waits) > 0:
-                count = meetings_of(scene, room, world, body)[0]
-                met += room.body_bars[world, body].met / count
-                lead += room.body_bars[world, body].lead / count
-            side += 1
-    return met, lead
+        index = scene.pair_index[found.pair]
+        if found.first_waits > 0:
+            count = room.meetings[world, scene.body_index[index.first].row][0]
+            of_first = room.body_bars[world, index.first]
+            bars.met += of_first.met / count
+            bars.lead += of_first.lead / count
+            bars.first_support = of_first.support
+        if found.second_waits > 0:
+            count = room.meetings[world, scene.body_index[index.second].row][0]
+            of_second = room.body_bars[world, index.second]
+            bars.met += of_second.met / count
+            bars.lead += of_second.lead / count
+            bars.second_support = of_second.support
+    return bars
 
 
 @after_adjoints
@@ -290,16 +236,19 @@ def pull_equations(
             if row >= 0 and not hangs(scene, row) and is_moved(room.step, world, block_of(scene, row)):
                 pull_momentum(scene, room, world, i)
     wait()
-    for f in range(n_found):
-        entry = f * _LANES + lane
-        twists = twists_of_pair(scene, room, world, entry)
-        met, lead = balance_bars(scene, room, world, entry)
-        if is_moved_pair(twists) or met != ZERO or lead != ZERO:
-            found = room.found[world, entry]
-            rebound = launch.reports[world, t].rebound
-            bar, by_twists = pull_pair(scene, room, world, lane, found, rebound, twists, met, lead)
-            if lane == 0:
-                add_pair(scene, room, world, found, bar, by_twists)
+    # When impulses take effect matters to all contact of a body: what has them wait comes last.
+    for k in range(2 * n_found):
+        entry = (k % n_found) * _LANES + lane
+        found = room.found[world, entry]
+        if (found.first_waits + found.second_waits > 0) == (k >= n_found):
+            twists = twists_of_pair(scene, room, world, entry)
+            waiting = waiting_bars(scene, room, world, found)
+            if is_moved_pair(twists) or not (waiting_product(waiting, waiting) == ZERO):
+                rebound = launch.reports[world, t].rebound
+                bar, by_twists = pull_pair(scene, room, world, lane, found, rebound, twists, waiting)
+                if lane == 0:
+                    add_pair(scene, room, world, found, bar, by_twists)
+            wait()
     if wp.static(PATCHES):
         for p in range(room.patches.count[world, 0]):
             touching = room.found[world, (n_found + p) * _LANES + lane]

@@ -49,7 +49,7 @@ def pullback(scene: Scene, room: Room, launch: Launch, ends: Ends):
                 clear_trees(scene, world, room.step)
                 follow_chains(scene, room, world)
         wait()
-        pull_end(scene, room, launch, world, lane, t, n_found)
+        pull_end(scene, room, launch, world, lane, t)
         # Virtual velocities λ, (∂R/∂V)ᵀ λ = V̄.
         if lane == 0:
             for b in range(scene.n_blocks):

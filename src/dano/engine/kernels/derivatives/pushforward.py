@@ -10,7 +10,7 @@ import warp as wp
 
 from dano.engine.kernels.derivatives.contact import add_part
 from dano.engine.kernels.derivatives.equations import (
-    is_moved,
+    body_product,
     pull_end,
     pull_equations,
     solve_settled,
@@ -53,7 +53,6 @@ def clear_bars(scene: wp.ref[Scene], room: wp.ref[Room], ends: wp.ref[Ends], wor
     if lane == 0:
         for b in range(scene.n_blocks):
             room.step[world, b] = vec6()
-            room.late[world, b] = vec6()
         for i in range(scene.body_index.shape[0]):
             room.body_bars[world, i] = BodyState()
     wait()
@@ -177,12 +176,11 @@ def push_equations(
 
 @wp.func
 def is_late(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> bool:
-    """Whether a number of the end depends on contact besides its velocities: see `pull_delays`."""
+    """Whether a number of the end depends on contact besides its velocities: impulses waited."""
     late = bool(False)
-    for b in range(scene.n_blocks):
-        late = late or is_moved(room.late, world, b)
     for i in range(scene.body_index.shape[0]):
-        late = late or room.body_bars[world, i].met != ZERO or room.body_bars[world, i].lead != ZERO
+        bar = room.body_bars[world, i]
+        late = late or not (body_product(bar, bar) == ZERO)
     return late
 
 
@@ -217,7 +215,7 @@ def push_end(
             if lane == 0:
                 ends.after[world, number] = ONE
             wait()
-            pull_end(scene, room, launch, world, lane, t, n_found)
+            pull_end(scene, room, launch, world, lane, t)
             if wp.static(not TREES):
                 if is_late(scene, room, world):
                     pull_equations(scene, room, launch, world, lane, t, n_found)

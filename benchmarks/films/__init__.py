@@ -1,0 +1,1 @@
+"""Whole films against the truth."""
