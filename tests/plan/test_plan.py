@@ -196,8 +196,8 @@ def test_new_plans_on_the_way_make_up_for_another_mass(pushing, pushed):
     assert again.values.shape == pushed.values.shape and again.converged
     same = dano.follow(scene, state, task, pushed)
     np.testing.assert_allclose(same.states.position[-1], pushed.trajectory.states.position[-1], atol=1e-6)
-    with pytest.raises(ValueError, match="scene must be a Scene, got NoneType"):
-        dano.Replanning(None, every=5)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="every must be ≥ 1, got 0"):
+        dano.Replanning(scene, every=0)
     odd = dataclasses.replace(scene, timestep=jnp.asarray(0.015))
     with pytest.raises(
         ValueError, match="timestep of replanning.scene must be the plan's 0.02 s or that divided by"

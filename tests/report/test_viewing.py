@@ -21,7 +21,7 @@ from dano.report.viewing._drawn import (
     BodyMesh,
     Drawn,
     shape_mesh,
-    Shown,
+    ShownExtras,
     surface_mesh,
 )
 from dano.report.viewing._field import FieldSurface
@@ -91,8 +91,8 @@ def test_numbers_beside_the_viewer_are_those_of_a_fall(fall):
         carried = drawn.numbers.force
         assert carried is not None
         assert carried[-1] == pytest.approx(0.3 * 9.81, rel=1e-3)
-        drawn.show_extras(Shown(trails=True, centres=True))
-        drawn.show_extras(Shown())
+        drawn.show_extras(ShownExtras(trails=True, centres=True))
+        drawn.show_extras(ShownExtras())
     finally:
         viewer.stop()
     soap = asset_look("trained_soap")
@@ -311,7 +311,7 @@ def test_arrows_of_forces_are_one_node_that_changes(fall):
     def fill(server):
         drawn = Drawn(server, scene, run, {}, None)
         for time in (0.0, float(run.times[-1]), 0.0, float(run.times[-2])):
-            drawn.show(time, Shown())
+            drawn.show(time, ShownExtras())
             arrows = drawn._forces
             shown.append((arrows, arrows is not None and arrows.visible, arrows and arrows.points))
         return None

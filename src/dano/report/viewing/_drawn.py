@@ -167,7 +167,7 @@ _TRAIL = 200
 """Points of a trail."""
 
 
-class Shown(NamedTuple):
+class ShownExtras(NamedTuple):
     """What is shown beside the bodies."""
 
     contacts: bool = True
@@ -258,7 +258,7 @@ class Drawn:
         radii = np.resize([0.5 * scene.bodies[i].size for i in shown], len(places))
         return open_on(self._server, places, radii, margin=0.05)
 
-    def show(self, time: float, shown: Shown) -> None:
+    def show(self, time: float, shown: ShownExtras) -> None:
         """Move everything to a time [s]."""
         with self._server.atomic():
             for handles, run in zip(self._handles, self._runs, strict=True):
@@ -289,7 +289,7 @@ class Drawn:
             if len(ends):
                 self._forces.points = ends.astype(np.float32)
 
-    def show_extras(self, shown: Shown) -> None:
+    def show_extras(self, shown: ShownExtras) -> None:
         """Draw trails, and centres of mass with principal axes, or take them away."""
         for handle in self._extras:
             handle.remove()

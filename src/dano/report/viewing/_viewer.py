@@ -21,7 +21,7 @@ import numpy as np
 
 from dano.checks import checked_function, checked_kind, checked_path, checked_text
 from dano.report._stage import check_run
-from dano.report.viewing._drawn import Drawn, Shown
+from dano.report.viewing._drawn import Drawn, ShownExtras
 from dano.report.viewing._serving import serve, Viewer, write_file
 from dano.scene import Scene, State, Trajectory
 from dano.vision import LearnedField
@@ -217,8 +217,8 @@ class Player:
         finally:
             self._busy.release()
 
-    def _shown(self) -> Shown:
-        return Shown(self._contacts.value, self._trails.value, self._centres.value)
+    def _shown(self) -> ShownExtras:
+        return ShownExtras(self._contacts.value, self._trails.value, self._centres.value)
 
     def _show(self) -> None:
         """Move everything to the current time."""
@@ -282,7 +282,7 @@ class LiveView:
 
         def fill(server: Any) -> Callable[[], None] | None:
             self._drawn = Drawn(server, scene, self._step(state, state), {}, None)
-            self._drawn.show(0.0, Shown(contacts=False))
+            self._drawn.show(0.0, ShownExtras(contacts=False))
             return None
 
         self._viewer = serve(fill, port=port, host=host, block=False)
@@ -293,8 +293,8 @@ class LiveView:
         assert self._drawn is not None
         made = self._step(before, after)
         self._drawn.replace(self._scene, made)
-        self._drawn.show(0.0, Shown())
-        self._drawn.show(float(np.asarray(made.times)[1]), Shown())
+        self._drawn.show(0.0, ShownExtras())
+        self._drawn.show(float(np.asarray(made.times)[1]), ShownExtras())
 
     def stop(self) -> None:
         """End the page; calling it again does nothing."""
@@ -406,7 +406,7 @@ def write_view(
         count = int(np.clip(round((times[-1] - times[0]) / TICK), 2, _MOST_FRAMES))
         film = server.get_scene_serializer()
         for now in np.linspace(times[0], times[-1], count):
-            drawn.show(float(now), Shown())
+            drawn.show(float(now), ShownExtras())
             film.insert_sleep(float(times[-1] - times[0]) / count)
         return with_panel(film.as_html(), scene, drawn, title, float(times[-1] - times[0]) / count)
 
