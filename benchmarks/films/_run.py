@@ -111,6 +111,8 @@ def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
         lower, upper = np.asarray(field.solid.solid_bounds, np.float64)
         truth = _Truth(drawn.position, drawn.orientation, 0.5 * (lower + upper), float((upper - lower).max()))
         options = _TRACKING
+    if field is None:
+        raise ValueError(f"rendered: {name} must have a learned field, got none")
     began = time.process_time()
     found = track(film, field, camera, options, background=empty)
     seconds = (time.process_time() - began) / len(film.times)

@@ -519,10 +519,10 @@ class Shown(NamedTuple):
 
     def light(self, towards: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "n 3 k"]:
         """Linear light that pixels get from far lamps of power one in some unit directions [W]."""
-        lamp, towards = Light((0.0, 0.0, 1.0)), jnp.asarray(towards, jnp.float32)
+        lamp, ways = Light((0.0, 0.0, 1.0)), jnp.asarray(towards, jnp.float32)
         rows = []
         for looking, places, n in self.parts:
-            rows.append(np.asarray(_lit(looking, places, lamp, towards), np.float64)[:, :n])
+            rows.append(np.asarray(_lit(looking, places, lamp, ways), np.float64)[:, :n])
         return np.moveaxis(np.concatenate(rows, axis=1), 0, -1)
 
 
