@@ -106,9 +106,11 @@ def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
         options = case.options("object")
     else:
         source = learned(folder, kind.toy, quick=arguments.quick)
-        field, drawn = LearnedField.of_object(source), filmed(folder, name, quick=arguments.quick)
-        film, camera, empty = drawn.film, drawn.camera, drawn.empty
-        lower, upper = np.asarray(field.solid.solid_bounds, np.float64)
+        toy, drawn = LearnedField.of_object(source), filmed(folder, name, quick=arguments.quick)
+        if toy is None:
+            raise ValueError(f"folder: {source} must have a learned field, got none")
+        field, film, camera, empty = toy, drawn.film, drawn.camera, drawn.empty
+        lower, upper = np.asarray(toy.solid.solid_bounds, np.float64)
         truth = _Truth(drawn.position, drawn.orientation, 0.5 * (lower + upper), float((upper - lower).max()))
         options = _TRACKING
     if field is None:
