@@ -24,21 +24,13 @@ _RATE = 40.0
 
 
 class Kind(NamedTuple):
-    """How a toy moves.
+    """How a toy moves."""
 
-    Attributes:
-        toy: Its name.
-        motion: "slide", "spin" or "throw".
-        number: Which view and light.
-        friction: Of slides.
-        held: Whether the camera is in a hand.
-    """
-
-    toy: str
-    motion: str
-    number: int
-    friction: float | None = None
-    held: bool = False
+    toy: str  # Its name
+    motion: str  # "slide", "spin" or "throw"
+    number: int  # Which view and light
+    friction: float | None = None  # Of slides
+    held: bool = False  # Whether the camera is in a hand
 
 
 KINDS = {
@@ -57,21 +49,13 @@ KINDS = {
 
 
 class Filmed(NamedTuple):
-    """A film that was drawn.
+    """A film that was drawn."""
 
-    Attributes:
-        film: Its frames, without masks.
-        camera: Of the first frame.
-        empty: Picture of the place.
-        position: True positions of the learned object's frame [m], shape (T, 3).
-        orientation: True orientations, shape (T, 4).
-    """
-
-    film: Film
-    camera: PosedCamera
-    empty: Path
-    position: np.ndarray
-    orientation: np.ndarray
+    film: Film  # Its frames, without masks
+    camera: PosedCamera  # Of the first frame
+    empty: Path  # Picture of the place
+    position: np.ndarray  # True positions of the learned object's frame [m], shape (T, 3)
+    orientation: np.ndarray  # True orientations, shape (T, 4)
 
 
 def learned(folder: Path, toy: str, *, quick: bool) -> Path:

@@ -101,20 +101,18 @@ def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
     kind, folder, source = KINDS.get(name), arguments.folder, None
     if kind is None:
         case = read_case(arguments.rendered / name)
-        film, camera, field, empty = without_masks(case.film), case.camera, case.field, case.background
+        film, camera, empty = without_masks(case.film), case.camera, case.background
+        field = _known(case.field, name)
         truth = _Truth(case.position, case.orientation, case.middle, case.size)
         options = case.options("object")
     else:
         source = learned(folder, kind.toy, quick=arguments.quick)
-        toy, drawn = LearnedField.of_object(source), filmed(folder, name, quick=arguments.quick)
-        if toy is None:
-            raise ValueError(f"folder: {source} must have a learned field, got none")
-        field, film, camera, empty = toy, drawn.film, drawn.camera, drawn.empty
-        lower, upper = np.asarray(toy.solid.solid_bounds, np.float64)
+        drawn = filmed(folder, name, quick=arguments.quick)
+        film, camera, empty = drawn.film, drawn.camera, drawn.empty
+        field = _known(LearnedField.of_object(source), name)
+        lower, upper = np.asarray(field.solid.solid_bounds, np.float64)
         truth = _Truth(drawn.position, drawn.orientation, 0.5 * (lower + upper), float((upper - lower).max()))
         options = _TRACKING
-    if field is None:
-        raise ValueError(f"rendered: {name} must have a learned field, got none")
     began = time.process_time()
     found = track(film, field, camera, options, background=empty)
     seconds = (time.process_time() - began) / len(film.times)
@@ -128,6 +126,17 @@ def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
     rows += [Row(group, "error", error, ""), Row(group, "truth", kind.friction, "")]
     rows.append(Row(group, _OFF, off, "σ", _INTERVAL))
     return rows
+
+
+def _known(field: LearnedField | None, name: str) -> LearnedField:
+    """A field that was learned.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if field is None:
+        raise ValueError(f"the object of {name} must have a learned field, got none")
+    return field
 
 
 def _friction(source: Path, found: Tracked) -> tuple[float, float]:

@@ -214,8 +214,8 @@ def moved_in_impact(body: BodyState, velocity: vec6) -> vec6:
 
 
 @wp.func
-def is_held(body: BodyState) -> bool:
-    """Whether a body moves by less than it falls in half a step: then others hold it."""
+def hardly_moves(body: BodyState) -> bool:
+    """Whether a body moves by less than it falls in half a step: others hold such a one."""
     if body.inverse_mass == ZERO:
         return False
     radius_squared = real(3.0) * body.inverse_mass / wp.trace(body.inverse_inertia)

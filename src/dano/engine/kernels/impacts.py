@@ -54,7 +54,7 @@ def leave_to_next(room: wp.ref[Room], world: int, k: int, h: real):
 
 
 @wp.func
-def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h: real):
+def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h: real) -> bool:
     """Have both sides of a pair that have an impact meet at one moment: else its momentum would change.
 
     The side that meets first says when. The other one takes part if it has met by then, too, but for δ. Else
@@ -66,6 +66,9 @@ def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h:
         earlier: The side that meets first.
         later: The other one.
         h: Timestep [s].
+
+    Returns:
+        Whether the other one takes part.
     """
     ahead = room.found[world, earlier]
     behind = room.found[world, later]
@@ -74,36 +77,41 @@ def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h:
     rests = way > behind.impact.depth and touches(room, world, behind)
     if way > behind.impact.depth and not rests:
         leave_to_next(room, world, later, h)
-    elif rests or until <= ZERO:
+        return False
+    if rests or until <= ZERO:
         room.found[world, earlier].impact = delayed(ahead.impact, ZERO, ahead.share, h)
         room.found[world, later].impact = delayed(behind.impact, ZERO, behind.share, h)
     else:
         room.found[world, later].impact = delayed(behind.impact, until / behind.share, behind.share, h)
+    return True
+
+
+@wp.func
+def both_take_part(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, one: int, other: int, first: int, second: int
+) -> bool:
+    """Whether both sides of a pair take part in one impact; they agree on its moment if both bodies move."""
+    mine = room.found[world, one]
+    theirs = room.found[world, other]
+    if mine.impact.stiffness == ZERO or theirs.impact.stiffness == ZERO:
+        return False
+    if wp.static(not TREES):
+        if scene.body_index[first].row >= 0 and scene.body_index[second].row >= 0:
+            earlier = wp.where(mine.share <= theirs.share, one, other)
+            return agree_on_moment(room, world, earlier, one + other - earlier, scene.timestep[world, 0])
+    return True
 
 
 @wp.func
 def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Have both sides of a pair take part in one impact: samples of the first body, and of the second."""
-    h = scene.timestep[world, 0]
     for f in range(1, n_found):
         one = (f - 1) * _LANES + lane
         other = f * _LANES + lane
         mine = scene.pair_index[room.found[world, one].pair]
         theirs = scene.pair_index[room.found[world, other].pair]
         if mine.first == theirs.second and mine.second == theirs.first:
-            if wp.static(not TREES):
-                both_move = scene.body_index[mine.first].row >= 0 and scene.body_index[mine.second].row >= 0
-                first = room.found[world, one]
-                second = room.found[world, other]
-                if both_move and first.impact.stiffness > ZERO and second.impact.stiffness > ZERO:
-                    if first.share <= second.share:
-                        agree_on_moment(room, world, one, other, h)
-                    else:
-                        agree_on_moment(room, world, other, one, h)
-            if (
-                room.found[world, one].impact.stiffness > ZERO
-                and room.found[world, other].impact.stiffness > ZERO
-            ):
+            if both_take_part(scene, room, world, one, other, mine.first, mine.second):
                 room.found[world, one].impact.part = HALF
                 room.found[world, other].impact.part = HALF
 
@@ -250,10 +258,12 @@ def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_
     wait()
     for f in range(n_found):
         k = f * _LANES + lane
-        found = room.found[world, k]
-        index = scene.pair_index[found.pair]
-        a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
-        room.found[world, k].com_difference = centres_apart(a, b, h)
+        index = scene.pair_index[room.found[world, k].pair]
+        # With impulses that act from the start, centres are where they are then.
+        if room.bodies[world, index.first].lead < ONE or room.bodies[world, index.second].lead < ONE:
+            found = room.found[world, k]
+            a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
+            room.found[world, k].com_difference = centres_apart(a, b, h)
 
 
 @wp.func

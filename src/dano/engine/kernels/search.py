@@ -52,7 +52,7 @@ from dano.physics.impacts import (
 from dano.physics.pairs import (
     BodyState,
     falling,
-    is_held,
+    hardly_moves,
     PairPose,
     speed_within,
 )
@@ -353,8 +353,8 @@ def find_pair(
         alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
         since = -ONE
         if not alone:
-            first_falls = wp.where(is_held(a), 0, 1)
-            second_falls = wp.where(is_held(b), 0, 1)
+            first_falls = wp.where(hardly_moves(a), 0, 1)
+            second_falls = wp.where(hardly_moves(b), 0, 1)
     found = FoundPair()
     found.pair = p
     found.first = at

@@ -235,16 +235,30 @@ def _pullback_plan(forward: LaunchPlan, which: tuple[int, ...]) -> LaunchPlan:
     outputs, views = _working(forward)
     outputs |= {"ends.controls": Shape(steps * _length(numbers, _CONTROLS), 1)}
     inputs = {"ends.ends": Shape(steps * _length(numbers, _STATE), 1), "ends.given": outputs["ends.values"]}
+    outputs |= {_MANY[name][0]: forward.inputs[name] for name in wanted if name in _MANY}
+    return _derivatives_plan(forward, "pullback", inputs, outputs, {}, {}, views)
+
+
+def _derivatives_plan(
+    forward: LaunchPlan,
+    kernel: str,
+    inputs: dict[str, Shape],
+    outputs: dict[str, Shape],
+    room: dict[str, int],
+    numbers: dict[str, Any],
+    views: dict[str, OutputView],
+) -> LaunchPlan:
+    """Of a kernel of derivatives, with what it is given, gives and needs besides those of the rollout."""
     return plan_of(
         LaunchPlan(
-            "dano.engine.kernels.derivatives.pullback",
-            "pullback",
+            f"dano.engine.kernels.derivatives.{kernel}",
+            kernel,
             forward.features.but(ADJOINTS=True),
             {**_places(forward), **inputs},
-            {**outputs, **{_MANY[name][0]: forward.inputs[name] for name in wanted if name in _MANY}},
+            outputs,
             forward.whole,
-            {**forward.room, **_pulling_room(forward)},
-            forward.numbers,
+            {**forward.room, **_pulling_room(forward), **room},
+            {**forward.numbers, **numbers},
             views,
         )
     )
@@ -373,19 +387,9 @@ def _pushforward_plan(forward: LaunchPlan, which: tuple[int, ...], n_directions:
     room = {_MANY[name][0]: x.rows for name, x in many.items() if name != _COEFFICIENTS}
     room |= {"room.lane_sums": n_directions, "room.along": n_directions, "room.moving": n_directions * row}
     room["room.missing"] = n_directions * forward.room["room.velocity"]
-    return plan_of(
-        LaunchPlan(
-            "dano.engine.kernels.derivatives.pushforward",
-            "pushforward",
-            forward.features.but(ADJOINTS=True),
-            {**_places(forward), **inputs},
-            {"ends.ends": Shape(steps * _length(numbers, _STATE), 1), **outputs},
-            forward.whole,
-            {**forward.room, **_pulling_room(forward), **room},
-            {**forward.numbers, "launch.n_directions": n_directions},
-            views,
-        )
-    )
+    outputs = {"ends.ends": Shape(steps * _length(numbers, _STATE), 1), **outputs}
+    directions = {"launch.n_directions": n_directions}
+    return _derivatives_plan(forward, "pushforward", inputs, outputs, room, directions, views)
 
 
 def _lowered(*inputs, plan, batched, n_worlds, which, differs, n_directions):

@@ -181,11 +181,10 @@ def linearized(
         return None
     gradient, hessian = _normal(rows)
     if loss == "photometric" and target.behind is not None:
-        move = _least_shown(found)
-        costs = [rows.cost]
-        for sign in (-1, 1):
-            moved = place.moved(sign * move, subject.radius)
-            costs.append(_rows(subject, target, moved, lamps, index, loss, slopes=False).cost)
+        way, doubt = _least_shown(found)
+        move = min(_WIDE * doubt, _WIDEST) * way
+        ends = [place.moved(sign * move, subject.radius) for sign in (-1, 1)]
+        costs = [rows.cost, *_costs_at(index, subject, target, ends, lamps, loss)]
         gradient, flatter = _along(move, gradient, hessian, *(len(index) * np.array(costs)))
         change = np.linalg.solve(flatter + _GROUND * np.trace(flatter) * np.eye(6), hessian)
         # Huber's sandwich with this Hessian.
@@ -223,8 +222,7 @@ def costs_of(
     shown = [index for index in chosen if index is not None]
     if not shown:
         return [np.inf] * len(places)
-    index = np.unique(np.concatenate(shown), axis=0)
-    return [_rows(subject, target, place, lamps, index, loss, slopes=False).cost for place in places]
+    return _costs_at(np.unique(np.concatenate(shown), axis=0), subject, target, places, lamps, loss)
 
 
 def beside(
@@ -256,19 +254,32 @@ def beside(
     index = _chosen(subject, target, found.place, lamps, rays, random)
     if index is None:
         return found.place
-    move = _least_shown(found)
-    move *= _WIDEST / max(float(np.linalg.norm(move)), 1e-9)
-    places = [found.place, *(found.place.moved(share * move, subject.radius) for share in _ALONG), *others]
-    costs = [_rows(subject, target, place, lamps, index, loss, slopes=False).cost for place in places]
-    return places[int(np.argmin(costs))]
+    way = _WIDEST * _least_shown(found)[0]
+    places = [found.place, *(found.place.moved(share * way, subject.radius) for share in _ALONG), *others]
+    return places[int(np.argmin(_costs_at(index, subject, target, places, lamps, loss)))]
 
 
-def _least_shown(found: Refined) -> Float[np.ndarray, "6"]:
-    """A move of the pose along what a picture shows least, with what is likeliest then of all else."""
+def _costs_at(
+    index: np.ndarray,
+    subject: Subject,
+    target: Target,
+    places: Sequence[Placement],
+    lamps: tuple[Light, ...],
+    loss: str,
+) -> list[float]:
+    """Mean robust costs of a pixel at several poses, over some pixels."""
+    return [_rows(subject, target, place, lamps, index, loss, slopes=False).cost for place in places]
+
+
+def _least_shown(found: Refined) -> tuple[Float[np.ndarray, "6"], float]:
+    """The direction of the pose that a picture shows least, with what is likeliest of all else.
+
+    And the standard deviation there.
+    """
     values, vectors = np.linalg.eigh(found.covariance)
     ground = _GROUND * np.trace(found.hessian) * np.eye(6)
     move = np.linalg.solve(found.hessian + ground, vectors[:, -1])
-    return move / np.linalg.norm(move) * min(_WIDE * np.sqrt(values[-1]), _WIDEST)
+    return move / np.linalg.norm(move), float(np.sqrt(values[-1]))
 
 
 def _along(

@@ -369,6 +369,33 @@ def add_to_depths(
 
 @after_adjoints
 @wp.func
+def pull_waiting(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    found: FoundPair,
+    twists: Virtual,
+    waiting: Waiting,
+    bar: MetPair,
+) -> tuple[FoundPair, MetPair]:
+    """Derivatives by when and how a pair meets whose impulses wait, and those by its bodies with them.
+
+    `bar` has those by when impulses on its bodies take effect, of its own: they are known by then.
+    """
+    own = waiting
+    own.met += real(found.first_waits) * bar.first.met + real(found.second_waits) * bar.second.met
+    whole = bar
+    whole.first.met = ZERO
+    whole.second.met = ZERO
+    apart = apart_at_start(scene, room, world, found)
+    by_found, by_apart, _a, _b = wp.grad(waiting_work)(found, apart, twists, own)
+    whole.first.position += by_apart
+    whole.second.position -= by_apart
+    return by_found, whole
+
+
+@after_adjoints
+@wp.func
 def pull_pair(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
@@ -409,18 +436,10 @@ def pull_pair(
         if wp.static(not TREES):
             alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
             if hits:
-                # Those by when its own impulses take effect are known by now.
-                own = waiting
-                own.met += real(found.first_waits) * bar.first.met + real(found.second_waits) * bar.second.met
-                bar.first.met = ZERO
-                bar.second.met = ZERO
-                apart = apart_at_start(scene, room, world, found)
-                by_found, by_apart, _a, _b = wp.grad(waiting_work)(found, apart, twists, own)
+                by_found, bar = pull_waiting(scene, room, world, found, twists, waiting, bar)
                 by.impact.delays += by_found.impact.delays
                 by.share += by_found.share
                 support_bar = by_found.support
-                bar.first.position += by_apart
-                bar.second.position -= by_apart
         by_impact, by_patch, by_material, by_factor, _d, _e, _f, _g, _h = wp.grad(impact_work)(
             at, found.patch, scene.materials[world, index.contact], pair.factor, turning, hits, alone,
             found.impact.delays > ZERO, by.impact,

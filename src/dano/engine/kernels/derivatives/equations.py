@@ -203,18 +203,20 @@ def waiting_bars(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: Fo
     if wp.static(not TREES):
         index = scene.pair_index[found.pair]
         if found.first_waits > 0:
-            count = room.meetings[world, scene.body_index[index.first].row][0]
-            of_first = room.body_bars[world, index.first]
-            bars.met += of_first.met / count
-            bars.lead += of_first.lead / count
-            bars.first_support = of_first.support
+            bars.first_support = room.body_bars[world, index.first].support
+            add_meeting(scene, room, world, index.first, bars)
         if found.second_waits > 0:
-            count = room.meetings[world, scene.body_index[index.second].row][0]
-            of_second = room.body_bars[world, index.second]
-            bars.met += of_second.met / count
-            bars.lead += of_second.lead / count
-            bars.second_support = of_second.support
+            bars.second_support = room.body_bars[world, index.second].support
+            add_meeting(scene, room, world, index.second, bars)
     return bars
+
+
+@wp.func
+def add_meeting(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, bars: wp.ref[Waiting]):
+    """Add one impulse's part of derivatives by when all that wait on a body take effect, the mean of them."""
+    count = room.meetings[world, scene.body_index[body].row][0]
+    bars.met += room.body_bars[world, body].met / count
+    bars.lead += room.body_bars[world, body].lead / count
 
 
 @after_adjoints
@@ -239,8 +241,9 @@ def pull_equations(
     # When impulses take effect matters to all contact of a body: what has them wait comes last.
     for k in range(2 * n_found):
         entry = (k % n_found) * _LANES + lane
-        found = room.found[world, entry]
-        if (found.first_waits + found.second_waits > 0) == (k >= n_found):
+        waits = room.found[world, entry].first_waits + room.found[world, entry].second_waits
+        if (waits > 0) == (k >= n_found):
+            found = room.found[world, entry]
             twists = twists_of_pair(scene, room, world, entry)
             waiting = waiting_bars(scene, room, world, found)
             if is_moved_pair(twists) or not (waiting_product(waiting, waiting) == ZERO):

@@ -169,9 +169,8 @@ def hanging_body_work(
     stands.orientation = to_wxyz(chain.orientation)
     stands.velocity = row.velocity
     stands.omega = row.omega
-    total = wp.dot(
-        momentum_gained(given, world, i, stands, matrix(from_wxyz(stands.orientation)), ONE, twist), virtual
-    )
+    gained = momentum_gained(given, world, i, stands, matrix(chain.orientation), ONE, twist)
+    total = wp.dot(gained, virtual)
     ahead = orientation_after(chain.before, chain.orientation)
     total += wp.dot(state_bar.position, chain.position) + wp.dot(state_bar.orientation, chain.orientation)
     total += wp.dot(state_bar.ahead, ahead) + wp.dot(state_bar.com, com_of(given, world, i))
