@@ -72,6 +72,9 @@ def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h:
     """
     ahead = room.found[world, earlier]
     behind = room.found[world, later]
+    if ahead.impact.delays == ZERO:
+        room.found[world, later].impact = delayed(behind.impact, ZERO, behind.share, h)
+        return True
     way = (behind.share - ahead.share) * h * -behind.patch.near_rate / behind.patch.near_load
     until = ahead.impact.delays * ahead.share
     rests = way > behind.impact.depth and touches(room, world, behind)
@@ -126,34 +129,36 @@ def any_hits(room: wp.ref[Room], world: int, lane: int, n_found: int) -> bool:
 
 
 @wp.func
-def note_partner(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int, holds: bool):
-    """Note that a body has an impact with another one, or with several, and whether that one holds it."""
-    if scene.body_index[body].row >= 0:
-        if holds:
-            room.bodies[world, body].held = ONE
-        elif room.partners[world, body] == _NOBODY or room.partners[world, body] == other:
-            room.partners[world, body] = other
-        else:
-            room.partners[world, body] = _SEVERAL
+def note_partner(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int, hits: bool):
+    """Note that a body has an impact with another one, or is held meanwhile: then with nobody, if that moves."""
+    if scene.body_index[body].row < 0:
+        return
+    partner = room.partners[world, body]
+    if hits:
+        room.partners[world, body] = wp.where(partner == _NOBODY or partner == other, other, _SEVERAL)
+    elif scene.body_index[other].row < 0:
+        room.bodies[world, body].held = ONE
+    else:
+        room.partners[world, body] = _SEVERAL
 
 
 @wp.func
 def find_partners(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, n_near: int):
-    """With which other one each body has an impact, and whether others hold it meanwhile."""
+    """With which other one each body has an impact, and whether fixed ones hold it meanwhile."""
     if lane == 0:
         for i in range(scene.body_index.shape[0]):
             room.partners[world, i] = _NOBODY
     for f in range(n_near):
         found = room.found[world, f * _LANES + lane]
-        quiet = bool(False)
+        hits = f >= n_found or found.impact.stiffness > ZERO
         holds = bool(False)
-        if f < n_found and found.impact.stiffness == ZERO:
-            quiet = is_quiet(scene, room, world, found)
-            holds = quiet and touches(room, world, found)
-        if lane == 0 and (holds or not quiet):
+        if not hits:
+            hits = not is_quiet(scene, room, world, found)
+            holds = not hits and touches(room, world, found)
+        if lane == 0 and (hits or holds):
             index = scene.pair_index[found.pair]
-            note_partner(scene, room, world, index.first, index.second, holds)
-            note_partner(scene, room, world, index.second, index.first, holds)
+            note_partner(scene, room, world, index.first, index.second, hits)
+            note_partner(scene, room, world, index.second, index.first, hits)
 
 
 @wp.func
@@ -249,6 +254,10 @@ def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_
             index = scene.pair_index[found.pair]
             found.first_waits = waits(room, world, index.first, index.second, found)
             found.second_waits = waits(room, world, index.second, index.first, found)
+            if scene.body_index[index.first].row >= 0 and scene.body_index[index.second].row >= 0:
+                both = found.first_waits * found.second_waits
+                found.first_waits = both
+                found.second_waits = both
             if found.first_waits + found.second_waits == 0:
                 found.impact = delayed(found.impact, ZERO, found.share, h)
             room.found[world, k] = found

@@ -235,6 +235,7 @@ def impact_of(
     pair: SamplePair,
     turning: int,
     alone: bool,
+    waits: bool,
 ) -> Impact:
     """The impact of a pair; none where it approaches slowly.
 
@@ -247,6 +248,7 @@ def impact_of(
         pair: The pair.
         turning: How samples turn with the first body.
         alone: Whether one of the bodies is fixed.
+        waits: Whether impulses may wait until the bodies meet.
     """
     impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, material.timestep)
     if patch.load > ZERO:
@@ -255,9 +257,7 @@ def impact_of(
             impact.stiffness = stiffness_of_impact(
                 a, b, patch, material.bounce, pair.factor, material.timestep
             )
-            delays = real(0.0)
-            if wp.static(not TREES):
-                delays = impact.share
+            delays = wp.where(waits, impact.share, ZERO)
             impact = delayed(impact, delays, found.share, material.timestep)
             impact.rests = left_out(found, pair.factor)
             if alone:
@@ -366,10 +366,19 @@ def find_pair(
     lasts = material.instant == ZERO
     met = Meeting()
     if not lasts:
+        seen = falling(a, first_falls)
+        other = falling(b, second_falls)
         met = meeting(
-            scene, room, world, lane, falling(a, first_falls), falling(b, second_falls), pair, index.first,
-            index.second, h, pair.impact_depth, slow, slow, since,
+            scene, room, world, lane, seen, other, pair, index.first, index.second, h, pair.impact_depth,
+            slow, slow, since,
         )  # fmt: skip
+        if not alone and met.share <= -ONE:
+            # Who of two that move has been in for longer is not known to either: they meet as the step begins.
+            since = ZERO
+            met = meeting(
+                scene, room, world, lane, seen, other, pair, index.first, index.second, h, pair.impact_depth,
+                slow, slow, since,
+            )  # fmt: skip
         # What moves so slowly has no impact.
         lasts = met.slow
     if lasts:
@@ -422,7 +431,7 @@ def find_pair(
         found.patch = patch
         found.impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, h)
         if not lasts:
-            found.impact = impact_of(seen, other, patch, material, found, pair, turning, alone)
+            found.impact = impact_of(seen, other, patch, material, found, pair, turning, alone, since < ZERO)
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share
