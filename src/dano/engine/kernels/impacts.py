@@ -57,8 +57,9 @@ def leave_to_next(room: wp.ref[Room], world: int, k: int, h: real):
 def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h: real) -> bool:
     """Have both sides of a pair that have an impact meet at one moment: else its momentum would change.
 
-    The side that meets first says when. The other one takes part if it has met by then, too, but for δ. Else
-    it is left to the next step, unless the bodies rest on it: then impulses act from the start of the step.
+    The side that meets first says when, or that impulses do not wait. The other one takes part if it has met
+    by then, too, but for δ. Else it is left to the next step, unless the bodies rest on it: then impulses act
+    from the start of the step.
 
     Args:
         room: Where the sides stand.
@@ -130,7 +131,7 @@ def any_hits(room: wp.ref[Room], world: int, lane: int, n_found: int) -> bool:
 
 @wp.func
 def note_partner(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int, hits: bool):
-    """Note that a body has an impact with another one, or is held meanwhile: then with nobody, if that moves."""
+    """Note that a body has an impact with another one, or is held by it: by one that moves as by several."""
     if scene.body_index[body].row < 0:
         return
     partner = room.partners[world, body]
@@ -162,11 +163,13 @@ def find_partners(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
 
 
 @wp.func
-def waits(room: wp.ref[Room], world: int, body: int, other: int, found: FoundPair) -> int:
-    """1 where impulses on a body take effect when it meets another one, else 0."""
+def may_wait(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int, found: FoundPair
+) -> bool:
+    """Whether impulses on a body may wait until it meets another one."""
     # What it rests on until then knows of no others.
     carried = wp.length_sq(found.support) > ZERO and room.bodies[world, body].held > ZERO
-    return wp.where(room.partners[world, body] == other and not carried, 1, 0)
+    return scene.body_index[body].row < 0 or (room.partners[world, body] == other and not carried)
 
 
 @wp.func
@@ -218,11 +221,13 @@ def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_fou
         found = room.found[world, f * _LANES]
         index = scene.pair_index[found.pair]
         met = vec3(ONE, found.impact.delays, found.impact.delays * found.share)
-        if found.first_waits > 0:
-            room.meetings[world, scene.body_index[index.first].row] += met
-        if found.second_waits > 0:
-            room.meetings[world, scene.body_index[index.second].row] += met
-        if found.first_waits + found.second_waits > 0 and wp.length_sq(found.support) > ZERO:
+        a = scene.body_index[index.first].row
+        b = scene.body_index[index.second].row
+        if found.waits > 0 and a >= 0:
+            room.meetings[world, a] += met
+        if found.waits > 0 and b >= 0:
+            room.meetings[world, b] += met
+        if found.waits > 0 and wp.length_sq(found.support) > ZERO:
             add_support(scene, room, world, found)
     for i in range(scene.moving.shape[0]):
         met = room.meetings[world, i]
@@ -236,10 +241,11 @@ def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_fou
 
 @wp.func
 def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, n_near: int):
-    """Have impulses on a body that has an impact with one other, and at most lies on others, wait for it.
+    """Have impulses of a pair wait for their impact, where each body has one with no other one.
 
     What is hit from two sides would else go on by what one of them does until the other begins: in a corner
-    that friction jams, the two impulses have no bound.
+    that friction jams, the two impulses have no bound. Nor does a pair wait of which a body lies on a third
+    one that moves: piles would take twice the passes.
     """
     if not any_hits(room, world, lane, n_found):
         return
@@ -252,13 +258,11 @@ def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_
         found = room.found[world, k]
         if found.impact.delays > ZERO:
             index = scene.pair_index[found.pair]
-            found.first_waits = waits(room, world, index.first, index.second, found)
-            found.second_waits = waits(room, world, index.second, index.first, found)
-            if scene.body_index[index.first].row >= 0 and scene.body_index[index.second].row >= 0:
-                both = found.first_waits * found.second_waits
-                found.first_waits = both
-                found.second_waits = both
-            if found.first_waits + found.second_waits == 0:
+            first = may_wait(scene, room, world, index.first, index.second, found)
+            second = may_wait(scene, room, world, index.second, index.first, found)
+            if first and second:
+                found.waits = 1
+            else:
                 found.impact = delayed(found.impact, ZERO, found.share, h)
             room.found[world, k] = found
     wait()
