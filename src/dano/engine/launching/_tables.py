@@ -36,7 +36,9 @@ _THIN = 0.25
 # Momentum that the damper of an impact passes on, see `dano.physics.impacts.Impact`: half the size over the
 # depth of the impact, within bounds. Where that is shallow, what has sunk in has to stop all of what comes.
 _SOFTEST, _HARDEST = 100.0, 1e4
-# Another part of a body, whose impact is left to the next step, gets in by at most this share of the size.
+# Another part of a body, whose impact is left to the next step, gets in by at most this share of the size; by
+# no more than an impact is deep where both bodies move. There a third one may keep what is left from waiting:
+# deep contact without an impact takes many passes.
 _DEEPEST = 0.04
 _STRUCTURES = "dano.engine.kernels.tables"
 # How samples turn with their body: see `dano.physics.pairs`.
@@ -346,7 +348,10 @@ def _kinds_of_bodies(
     columns = [] if others is None else jax.tree.leaves((others.params, others.of_edges))
     if is_traced(extents, columns) or n == 0:
         return np.arange(n)
-    told = [np.array([body.surface is not None and body.surface.turning != "fixed" for body in bodies])]
+    told = [
+        np.array([body.surface is not None and body.surface.turning != "fixed" for body in bodies]),
+        np.array([body.fixed for body in bodies]),
+    ]
     if others is not None:
         told += [np.array(x) for x in (others.flat, others.shapes, others.fixed)]
     numbers = [np.asarray(x, float).reshape(n, -1) for x in (extents, *columns, *told)]
@@ -396,14 +401,17 @@ def _pairs(
     size, thickness = xp.minimum(extents[first, 4:], extents[second, 4:]).T
     gravity_step = _strength(scene) * h * h
     depths = _impact_depths(groups, dtype)[material]
+    impact_depth = xp.minimum(depths, _THIN * thickness)
+    moves = np.array([not body.fixed for body in bodies])
+    deepest = xp.minimum(_DEEPEST * size, _THIN * thickness)
     return packed(
         features,
         "SamplePair",
         share=share.astype(dtype),
         follows=(smooth[second] & ~smooth[first]).astype(dtype),
         sink=xp.minimum(_SINK * size, _THIN * thickness),
-        impact_depth=xp.minimum(depths, _THIN * thickness),
+        impact_depth=impact_depth,
         factor=xp.clip(0.5 * size / depths, _SOFTEST, _HARDEST),
-        deepest=xp.minimum(_DEEPEST * size, _THIN * thickness),
+        deepest=xp.where(moves[first] & moves[second], impact_depth, deepest),
         margin=_MARGIN * size + 2 * gravity_step.astype(dtype),
     )
