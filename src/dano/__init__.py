@@ -32,12 +32,10 @@ from dano.objects import (
 from dano.contact import (
     AbstractContactLaw as AbstractContactLaw,
     CentroidLaw as CentroidLaw,
-    Collider as Collider,
     ContactParams as ContactParams,
     Distance as Distance,
     distance as distance,
     DistributedLaw as DistributedLaw,
-    overlap as overlap,
     Patch as Patch,
 )
 from dano.scene import (
