@@ -149,6 +149,7 @@ def train(
     options: TrainOptions | None = None,
     *,
     table: float | None = None,
+    views: int | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
@@ -161,6 +162,7 @@ def train(
         options: How; default `TrainOptions()`.
         table: Height z of a level table [m, W] that the object stands on: masks that are doubted (those that
             `with_masks` found on a table) are only a beginning, and colours of object and table decide.
+        views: Train on so many of the views only.
         checkpoint: File that the state is written to at each evaluation, and when interrupted.
         resume: Go on from `checkpoint` if it exists.
         progress: Called after every few steps, while cavities are looked for and during training.
@@ -178,6 +180,8 @@ def train(
     start = time.perf_counter()
     options = TrainOptions() if options is None else options
     folder = None if previews is None else checked_folder(previews)
+    if views is not None:
+        capture = capture.thinned(views)
     near = {view.light_is_near for view in capture.views if view.light is not None}
     if len(near) > 1:
         raise ValueError("lights must be given as directions or as positions, got some of each")
