@@ -65,14 +65,21 @@ _BYTES_PER_NODE = 400
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """How finely an object is written, and what touches."""
+    """How finely an object is written, and what touches.
 
-    # coacd: convex decomposition; hull: convex hull; auto: the first if coacd is installed.
+    Attributes:
+        collision: coacd: convex decomposition; hull: convex hull; auto: the first if coacd is installed.
+        concavity: Of CoACD: how deep a piece may be concave, as a share of the size; in [0.01, 1].
+        max_pieces: Most pieces of CoACD; default: as many as `concavity` takes.
+        resolution: Nodes along the longest axis for the visible surface, from 8 to 512.
+        texture_size: Texels along the picture with the colours, from 64 to 8192.
+    """
+
     collision: Collision = "auto"
-    concavity: float = 0.05  # Of CoACD: how deep a piece may be concave, as a share of the size; in [0.01, 1]
-    max_pieces: int | None = None  # Most pieces of CoACD; default: as many as `concavity` takes
-    resolution: int = 64  # Nodes along the longest axis for the visible surface, from 8 to 512
-    texture_size: int = 1024  # Texels along the picture with the colours, from 64 to 8192
+    concavity: float = 0.05
+    max_pieces: int | None = None
+    resolution: int = 64
+    texture_size: int = 1024
 
     def __post_init__(self) -> None:
         """Check all numbers.

@@ -22,16 +22,25 @@ _NEED = "environments need gymnasium"
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """How a scene and a task become an environment."""
+    """How a scene and a task become an environment.
 
-    # Makes the state where an episode begins instead, from the environment's random numbers.
+    Attributes:
+        start: Makes the state where an episode begins instead, from the environment's random numbers.
+        repeat: Steps of the scene in a step of the environment.
+        shaping: Reward for each unit by which the goals' errors fall.
+        engine: Default `VariationalEngine()`.
+        render_mode: "rgb_array", of a single one also "human" (extra `view`), or None.
+        size: Width and height of pictures [pixels], even numbers.
+        camera: From where they are taken, in place of `size`; default: sees all.
+    """
+
     start: Start | None = None
-    repeat: int = 1  # Steps of the scene in a step of the environment
-    shaping: float = 1.0  # Reward for each unit by which the goals' errors fall
-    engine: AbstractEngine | None = None  # Default `VariationalEngine()`
-    render_mode: str | None = None  # "rgb_array", of a single one also "human" (extra `view`), or None
-    size: tuple[int, int] = (640, 400)  # Width and height of pictures [pixels], even numbers
-    camera: Camera | None = None  # From where they are taken, in place of `size`; default: sees all
+    repeat: int = 1
+    shaping: float = 1.0
+    engine: AbstractEngine | None = None
+    render_mode: str | None = None
+    size: tuple[int, int] = (640, 400)
+    camera: Camera | None = None
 
     def __post_init__(self) -> None:
         """Check what can be checked without a scene.

@@ -38,20 +38,26 @@ _MOMENTS = 5
 
 @dataclasses.dataclass(frozen=True)
 class FilmOptions:
-    """Which frames and pixels of a rollout are rendered, and how."""
+    """Which frames and pixels of a rollout are rendered, and how.
 
-    every: int = 1  # Steps between frames; the first frame shows the initial state
-    # Image coordinates (x to the right, y downwards) of the pixels wanted; default: all, row by row. Fewer
-    # cost less, e.g. those near silhouettes.
+    Attributes:
+        every: Steps between frames; the first frame shows the initial state.
+        pixels: Image coordinates (x to the right, y downwards) of the pixels wanted; default: all, row by
+            row. Fewer cost less, e.g. those near silhouettes.
+        background: sRGB behind the bodies, of one colour (3,) or of every pixel (n, 3).
+        shutter: How long a frame is exposed, half before and half after its time [s]; what moves is blurred.
+        sampling: How finely rays are sampled.
+    """
+
+    every: int = 1
     pixels: Float[np.ndarray, "n 2"] | None = None
     background: Numbers = (
         0.0,
         0.0,
         0.0,
-    )  # sRGB behind the bodies, of one colour (3,) or of every pixel (n, 3)
-    # How long a frame is exposed, half before and half after its time [s]; what moves is blurred.
+    )
     shutter: float = 0.0
-    sampling: Sampling = FILM_SAMPLING  # How finely rays are sampled
+    sampling: Sampling = FILM_SAMPLING
 
     def __post_init__(self) -> None:
         """Check what can be checked without a camera.

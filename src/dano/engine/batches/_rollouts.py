@@ -112,24 +112,32 @@ def load_rollouts(path: str | os.PathLike[str]) -> StoredRollouts:
 
 
 class RolloutOptions(TypedDict, total=False):
-    """What is rolled out, how much at once, and what is kept of it: options of `rollouts`."""
+    """What is rolled out, how much at once, and what is kept of it: options of `rollouts`.
 
-    # Arrays with a leading axis, or a tree of them: what `scene`, a function, is called with, row by row.
+    Attributes:
+        parameters: Arrays with a leading axis, or a tree of them: what `scene`, a function, is called with,
+            row by row.
+        controls: Forces and torques, leaves of shape (r, n_steps, n_bodies, 3), or (n_steps, n_bodies, 3) for
+            all, or a function of (state, time [s]), as in `simulate`.
+        engine: Default `VariationalEngine()`.
+        keep: Which states to keep: "all" (the default), "last", or a number k: the first, every k-th and the
+            last.
+        batch_size: Rollouts that a device simulates at once; default 32 on a CPU, where more of them leave
+            the cache, and 8192 elsewhere.
+        chunk_size: Rollouts between two calls of `progress`, and in a file; a multiple of `batch_size`.
+            Default up to eight batches, fewer if few rollouts share many devices or much is kept.
+        devices: Some of `jax.local_devices()`; default all.
+        progress: Called with a description and the share done.
+    """
+
     parameters: Any
-    # Forces and torques, leaves of shape (r, n_steps, n_bodies, 3), or (n_steps, n_bodies, 3) for all, or a
-    # function of (state, time [s]), as in `simulate`.
     controls: Control | Policy | None
-    engine: AbstractEngine | None  # Default `VariationalEngine()`
-    # Which states to keep: "all" (the default), "last", or a number k: the first, every k-th and the last.
+    engine: AbstractEngine | None
     keep: str | int
-    # Rollouts that a device simulates at once; default 32 on a CPU, where more of them leave the cache, and
-    # 8192 elsewhere.
     batch_size: int | None
-    # Rollouts between two calls of `progress`, and in a file; a multiple of `batch_size`. Default up to eight
-    # batches, fewer if few rollouts share many devices or much is kept.
     chunk_size: int | None
-    devices: Sequence[Any] | None  # Some of `jax.local_devices()`; default all
-    progress: Progress | None  # Called with a description and the share done
+    devices: Sequence[Any] | None
+    progress: Progress | None
 
 
 @overload
