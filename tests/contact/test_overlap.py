@@ -95,9 +95,8 @@ def test_ball_on_plane_against_quadrature():
 
 @pytest.fixture(scope="module")
 def pair():
-    fields = blob(seed=0), blob(seed=5)
-    samples = random_samples(fields[0]), random_samples(fields[1], seed=2)
-    return [Side(*each, mass=mass) for *each, mass in zip(fields, samples, (2.0, 3.0), strict=True)]
+    a, b = blob(seed=0), blob(seed=5)
+    return [Side(a, random_samples(a), mass=2.0), Side(b, random_samples(b, seed=2), mass=3.0)]
 
 
 def posed_pair(pair, *poses):
