@@ -127,24 +127,25 @@ def identify_load_on_arm(
         )
     if fit.null[:4].max() < 1e-3 and fit.theta[0] > 0:
         _estimate.check_slip(rows, fit, log.times)
-
     drift = np.zeros(count) if change is None else change
+    return _estimate.load_of(fit, messages, points, lambda theta: _of_joints(fit, theta, drift))
 
-    def sensor(theta: np.ndarray) -> dict:
-        nothing, joints = np.full(3, np.nan), theta[10 : 10 + 3 * count].reshape(3, count)
-        return {
-            "force_bias": nothing,
-            "torque_bias": nothing,
-            "drift": np.full(6, np.nan),
-            "force_noise": float("nan"),
-            "torque_noise": float("nan"),
-            "joint_bias": joints[0],
-            "joint_friction": joints[1:].T,
-            "joint_noise": fit.noise,
-            "joint_drift": drift,
-        }
 
-    return _estimate.load_of(fit, messages, points, sensor)
+def _of_joints(fit: _estimate.LoadFit, theta: np.ndarray, drift: np.ndarray) -> dict[str, Any]:
+    """Bias, friction, drift and noise of joints, as fields of a load; a wrist's are not known."""
+    nothing, count = np.full(3, np.nan), len(drift)
+    joints = theta[10 : 10 + 3 * count].reshape(3, count)
+    return {
+        "force_bias": nothing,
+        "torque_bias": nothing,
+        "drift": np.full(6, np.nan),
+        "force_noise": float("nan"),
+        "torque_noise": float("nan"),
+        "joint_bias": joints[0],
+        "joint_friction": joints[1:].T,
+        "joint_noise": fit.noise,
+        "joint_drift": drift,
+    }
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
