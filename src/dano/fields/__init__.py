@@ -60,7 +60,7 @@ from dano.fields.readers import (
     FIELD_SUFFIXES as FIELD_SUFFIXES,
     is_splats as is_splats,
     load_field as load_field,
-    offer_learned as offer_learned,
+    offer_models as offer_models,
     read_splats as read_splats,
     save_field as save_field,
     Splats as Splats,

@@ -43,6 +43,7 @@ from dano.vision.radiance import (
     Doubt as Doubt,
     LearnedField as LearnedField,
     Network as Network,
+    OSF as OSF,
     picture as picture,
     RenderedPicture as RenderedPicture,
     Sampling as Sampling,
