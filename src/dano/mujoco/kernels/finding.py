@@ -253,24 +253,46 @@ def meeting(known: wp.ref[Known], model: wp.ref[Model], side: Side, sink: real, 
     return share
 
 
-@wp.func(inline=True)
-def side_touch(
-    side: Side, pose: PairPose, share: real, h: real, x: vec3, normal: vec3, distance: real
-) -> Touch:
-    """A sample at x of the solid's frame after a share of the step, as both bodies see it at the start."""
-    touch = Touch()
-    before = rotation_after(side.b, ZERO)
-    origin = side.b.position - before * side.b.com
-    below = origin + before * (x - distance * normal)
-    above = origin + before * x
+@wp.struct
+class AtStart:
+    """Where points of the solid's frame after a share of the step are when it begins [m, W].
+
+    Attributes:
+        turn: Of the solid's body.
+        origin: Of its frame.
+        samples_turn: Of the samples' body, for the same point of that.
+        samples_origin: The same.
+    """
+
+    turn: mat33
+    origin: vec3
+    samples_turn: mat33
+    samples_origin: vec3
+
+
+@wp.func
+def at_start(side: Side, share: real, h: real) -> AtStart:
+    """Both bodies at the start of the step, as seen after a share of it."""
+    found = AtStart()
+    found.turn = rotation_after(side.b, ZERO)
+    found.origin = side.b.position - found.turn * side.b.com
+    found.samples_turn = found.turn
+    found.samples_origin = found.origin
     if share > ZERO:
-        # The same point of the samples' body, where that is at the start.
-        after = side.b.position + (share * h) * side.b.velocity
-        place = after + rotation_after(side.b, share) * (x - side.b.com)
-        arm = place - side.a.position - (share * h) * side.a.velocity
-        still = wp.transpose(rotation_after(side.a, share)) * arm
-        above = side.a.position + rotation_after(side.a, ZERO) * still
-    n = before * normal
+        back = rotation_after(side.a, ZERO) * wp.transpose(rotation_after(side.a, share))
+        found.samples_turn = back * rotation_after(side.b, share)
+        apart = side.b.position - side.a.position + (share * h) * (side.b.velocity - side.a.velocity)
+        found.samples_origin = side.a.position + back * apart - found.samples_turn * side.b.com
+    return found
+
+
+@wp.func(inline=True)
+def side_touch(side: Side, pose: PairPose, start: AtStart, x: vec3, normal: vec3, distance: real) -> Touch:
+    """A sample at x of the solid's frame, as both bodies see it at the start of the step."""
+    touch = Touch()
+    below = start.origin + start.turn * (x - distance * normal)
+    above = start.samples_origin + start.samples_turn * x
+    n = start.turn * normal
     touch.position = HALF * (above + below)
     touch.gap = wp.dot(n, above - below)
     touch.normal = side.sign * n
@@ -301,6 +323,7 @@ def list_side(
             share = ZERO
             fast = False
     pose = side_pose(known, side, share, h)
+    start = at_start(side, share, h)
     stretch = stretch_of(side)
     reach = margin
     if fast:
@@ -325,11 +348,11 @@ def list_side(
                 if side.other.solid == _GRID:
                     d.value = seen - STEEPEST * wp.length(x - seen_at)
                 if d.value <= reach + side.slack:
-                    d.value = quick_clearance(known, side.other, x)
-                if d.value <= reach + side.slack:
-                    d, flat = distance_with_faces(known, model, side.other, side.band, x)
+                    d.value = quick_clearance(known, side.other, x, reach + side.slack)
                     seen = d.value
                     seen_at = x
+                if d.value <= reach + side.slack:
+                    d, flat = distance_with_faces(known, model, side.other, side.band, x)
                 if d.value <= reach:
                     normal, flat = pressed_normal(
                         pose, side.other.solid, known.facing[s], solid_normal(d.gradient), flat
@@ -340,7 +363,7 @@ def list_side(
                         area = ZERO
                     # Samples on the far side of a thin body do not press.
                     if area > ZERO:
-                        touch = side_touch(side, pose, share, h, x, normal, d.value)
+                        touch = side_touch(side, pose, start, x, normal, d.value)
                         over = touch.gap - margin + gap
                         end = over - h * touch.nearing
                         early = fast and end < -sink
@@ -362,13 +385,40 @@ def list_side(
                                     own = -solid_normal(d.gradient)
                                 if side.index.turning == 0 or flat == 2:
                                     touch.flat = 2
-                                    touch.slope = rotation_after(side.b, ZERO) * slope_of(own, normal)
+                                    touch.slope = start.turn * slope_of(own, normal)
                             touch.precedence = known.precedence[s]
                             touch.presses = wp.where(early or over < ZERO, 1, 0)
                             work.touches[at] = touch
                             at += 1
             block += 1
     return at
+
+
+@wp.func
+def are_apart(a: Part, b: Part, turn: mat33, other: mat33, way: vec3, reach: real) -> bool:
+    """Whether the boxes around two parts are further apart than `reach` [m] along one of their axes.
+
+    Args:
+        a: A part.
+        b: The other.
+        turn: Rotation of the first.
+        other: Of the second.
+        way: From the middle of the first to that of the second [m, W].
+        reach: The distance.
+    """
+    relative = wp.transpose(turn) * other
+    seen = wp.transpose(turn) * way
+    seen_back = wp.transpose(other) * way
+    apart = bool(False)
+    for i in range(3):
+        size = a.half[i] + reach
+        size_back = b.half[i] + reach
+        for j in range(3):
+            size += wp.abs(relative[i, j]) * b.half[j]
+            size_back += wp.abs(relative[j, i]) * a.half[j]
+        if wp.abs(seen[i]) > size or wp.abs(seen_back[i]) > size_back:
+            apart = True
+    return apart
 
 
 @wp.func
@@ -389,6 +439,11 @@ def list_pair(
     side = Side()
     side.index = known.index[second]
     side.other = known.index[first]
+    # Of a polyhedron nothing is deeper in a half-space than a corner.
+    if side.other.solid == _HALF_SPACE and side.index.corner_blocks > 0:
+        side.index.first_block = side.index.first_corner_block
+        side.index.first_run = side.index.first_corner_run
+        side.index.blocks = side.index.corner_blocks
     settings = pair_settings(known, model, options, work.settings, world, pair)
     if settings.dim == ZERO:
         return begin
@@ -413,6 +468,10 @@ def list_pair(
             around = model.geom_rbound[world, side.other.geom]
         apart = middle - middle_of(part, side.b)
         if wp.dot(apart, apart) > (reach + around) * (reach + around):
+            return begin
+        turn = rotation_after(side.a, ZERO)
+        other = rotation_after(side.b, ZERO)
+        if are_apart(side.part, part, turn, other, apart, settings.margin + way):
             return begin
     if side.other.solid == _UNKNOWN:
         return -2 - side.other.geom

@@ -19,6 +19,7 @@ from dano.mujoco.kernels.mixing import held_back, in_parallel, softened
 from dano.mujoco.kernels.tables import (
     ContactIndex,
     ContactRow,
+    Led,
     Options,
     PartIndex,
     Settings,
@@ -235,12 +236,18 @@ def spread_of(touches: wp.array(dtype=Touch), begin: int, end: int) -> real:
 
 
 @wp.func(inline=True)
-def pull(head: Touch, touch: Touch, near: real) -> real:
-    """How much of a sample a head draws, beside others; `near`: ε² [m²]."""
-    arm = touch.position - head.position
-    facing = wp.max(ONE + wp.dot(touch.normal, head.normal), _AGAINST)
+def pull(kept: real, arm: vec3, cosine: real, near: real) -> real:
+    """How much of a sample a head draws, beside others.
+
+    Args:
+        kept: Of the head.
+        arm: From the head to the sample [m].
+        cosine: Of the angle between their normals.
+        near: ε² [m²].
+    """
+    facing = wp.max(ONE + cosine, _AGAINST)
     closeness = facing / (near + wp.dot(arm, arm))
-    return head.kept * closeness * closeness
+    return kept * closeness * closeness
 
 
 @wp.func
@@ -260,12 +267,41 @@ def find_heads(work: wp.ref[Work], begin: int, end: int, most: int) -> int:
 
 
 @wp.func
-def pull_on(work: wp.ref[Work], touch: Touch, heads: int, near: real) -> real:
-    """How much all heads draw a sample."""
-    total = ZERO
+def gather(work: wp.ref[Work], begin: int, end: int, heads: int, near: real):
+    """Give each sample's load to the heads: see `Led`."""
     for k in range(heads):
-        total += pull(work.touches[work.heads[k]], touch, near)
-    return total
+        work.led[k] = Led()
+    for i in range(begin, end):
+        position = work.touches[i].position
+        normal = work.touches[i].normal
+        load = work.touches[i].weight
+        gap = work.touches[i].gap
+        nearing = work.touches[i].nearing
+        presses = work.touches[i].presses
+        own = work.touches[i].kept
+        drawn = ZERO
+        for k in range(heads):
+            head = work.heads[k]
+            arm = position - work.touches[head].position
+            cosine = wp.dot(normal, work.touches[head].normal)
+            work.scores[k] = pull(work.touches[head].kept, arm, cosine, near)
+            drawn += work.scores[k]
+        left = (ONE - own) / drawn
+        for k in range(heads):
+            head = work.heads[k]
+            arm = position - work.touches[head].position
+            w = left * work.scores[k]
+            if i == head:
+                w += own
+            work.led[k].squares += w * load * load
+            w = w * load
+            work.led[k].weight += w
+            work.led[k].force += w * normal
+            work.led[k].moment += w * wp.cross(arm, normal)
+            work.led[k].place += w * arm
+            work.led[k].gap += w * gap
+            work.led[k].nearing += w * nearing
+            work.led[k].presses = wp.max(work.led[k].presses, presses)
 
 
 @wp.func
@@ -280,45 +316,24 @@ def tangents(n: vec3) -> vec9:
 
 
 @wp.func
-def led_touch(work: wp.ref[Work], head: int, begin: int, end: int, near: real) -> tuple[Touch, real]:
+def led_touch(head: Touch, led: Led) -> tuple[Touch, real]:
     """One touch for the share of a head, and the number of samples that it stands for, (Σw)²/Σw².
 
     Its weight times its normal is their force. It presses if one of them does.
     """
-    merged = work.touches[head]
-    weight = ZERO
-    squares = ZERO
-    force = vec3()
-    moment = vec3()
-    place = vec3()
-    gap = ZERO
-    nearing = ZERO
-    for i in range(begin, end):
-        touch = work.touches[i]
-        w = (ONE - touch.kept) * pull(merged, touch, near) / touch.drawn
-        if i == head:
-            w += touch.kept
-        squares += w * touch.weight * touch.weight
-        w = w * touch.weight
-        arm = touch.position - merged.position
-        weight += w
-        force += w * touch.normal
-        moment += w * wp.cross(arm, touch.normal)
-        place += w * arm
-        gap += w * touch.gap
-        nearing += w * touch.nearing
-        merged.presses = wp.max(merged.presses, touch.presses)
-    squared = wp.dot(force, force)
+    merged = head
+    merged.presses = wp.max(merged.presses, led.presses)
+    squared = wp.dot(led.force, led.force)
     # Where normals oppose each other, no one contact does what they do, and the head stands for itself.
-    if squared > HALF * HALF * weight * weight:
-        place = place / weight
-        moment -= wp.cross(place, force)
+    if squared > HALF * HALF * led.weight * led.weight:
+        place = led.place / led.weight
+        moment = led.moment - wp.cross(place, led.force)
         merged.weight = wp.sqrt(squared)
-        merged.position += place + wp.cross(force, moment) / squared
-        merged.normal = force / merged.weight
-        merged.gap = gap / weight
-        merged.nearing = nearing / weight
-    return merged, weight * weight / squares
+        merged.position += place + wp.cross(led.force, moment) / squared
+        merged.normal = led.force / merged.weight
+        merged.gap = led.gap / led.weight
+        merged.nearing = led.nearing / led.weight
+    return merged, led.weight * led.weight / led.squares
 
 
 @wp.func
@@ -392,10 +407,9 @@ def merge(
     set_scores(work, begin, end, flat == 1)
     heads = find_heads(work, begin, end, most)
     near = _SPREAD * spread_of(work.touches, begin, end) / real(most)
-    for i in range(begin, end):
-        work.touches[i].drawn = pull_on(work, work.touches[i], heads, near)
+    gather(work, begin, end, heads, near)
     for k in range(heads):
-        touch, samples = led_touch(work, work.heads[k], begin, end, near)
+        touch, samples = led_touch(work.touches[work.heads[k]], work.led[k])
         touch = lowest(touch, bulge)
         write(
             work,

@@ -6,7 +6,7 @@ from dano.mujoco.kernels.tables import Known, Model, PartIndex
 from dano.mujoco.kernels.words import HEIGHTS, HULL
 from dano.physics.real import INFINITY, ONE, real, vec3, vec4, ZERO
 from dano.physics.solids.distances import leaf_clearance, leaf_distance
-from dano.physics.solids.grids import closest_in_grid, coarse_bound, place_in_grid
+from dano.physics.solids.grids import closest_in_grid, coarse_bound, grid_value, place_in_grid
 from dano.physics.solids.kinds import BOX, ELLIPSOID, GRID, HALF_SPACE
 from dano.physics.solids.leaves import Distance
 
@@ -127,19 +127,25 @@ def distance_with_faces(
 
 
 @wp.func(inline=True)
-def grid_bound(known: Known, part: PartIndex, x: vec3) -> real:
-    """A lower bound on `part_distance` of an object [m]: that of a few cells, and the way to them."""
+def grid_bound(known: Known, part: PartIndex, x: vec3, enough: real) -> real:
+    """`part_distance` of an object [m], or a lower bound that exceeds `enough`: of a few cells, and the way."""
     leaf = known.solids.leaves[0, part.at]
     kind = known.solids.kinds[part.at]
     u = place_in_grid(leaf, (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position)))
     closest = closest_in_grid(kind, u)
     away = wp.length(wp.cw_mul(u - closest, leaf.spacing))
-    return leaf.factor * (coarse_bound(known.solids, 0, kind, closest) + away)
+    bound = leaf.factor * (coarse_bound(known.solids, 0, kind, closest) + away)
+    if bound <= enough:
+        bound = leaf.factor * (grid_value(known.solids, 0, kind, closest) + away)
+    return bound
 
 
 @wp.func(inline=True)
-def quick_clearance(known: Known, part: PartIndex, x: vec3) -> real:
-    """A lower bound on the distance of a part's solid [m] where that takes far less than the distance."""
+def quick_clearance(known: Known, part: PartIndex, x: vec3, enough: real) -> real:
+    """A lower bound on the distance of a part's solid [m] where that takes far less than with its gradient.
+
+    Any that exceeds `enough` will do.
+    """
     bound = real(-INFINITY)
     if part.solid == _HALF_SPACE:
         # MuJoCo's planes are normal to their z axis.
@@ -153,7 +159,7 @@ def quick_clearance(known: Known, part: PartIndex, x: vec3) -> real:
         half = known.solids.leaves[0, part.at].sizes
         bound = wp.max(wp.abs(x[0]) - half[0], wp.max(wp.abs(x[1]) - half[1], wp.abs(x[2]) - half[2]))
     elif part.solid == _GRID:
-        bound = grid_bound(known, part, x)
+        bound = grid_bound(known, part, x, enough)
     return bound
 
 
@@ -167,9 +173,9 @@ def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3, enough:
         # Heights are at most 1 of their scale.
         bound = x[2] - model.hfield_size[part.at][2]
     elif part.solid == _ELLIPSOID:
-        bound = quick_clearance(known, part, x)
+        bound = quick_clearance(known, part, x, enough)
     elif part.solid == _BOX:
-        bound = quick_clearance(known, part, x)
+        bound = quick_clearance(known, part, x, enough)
         if bound <= enough:
             bound = part_distance(known, model, part, x).value
     else:

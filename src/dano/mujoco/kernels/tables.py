@@ -25,7 +25,8 @@ class Part:
     """A geom or an object.
 
     Attributes:
-        middle: Centre of a ball around an object [m]; geoms have it at their origin.
+        middle: Centre of a ball and of a box around an object [m]; geoms have it at their origin.
+        half: Half the sides of that box, along the axes of the frame [m]; endless where there is none.
         scale: Semi-axes of a ball or an ellipsoid, ones for others [m].
         radius: Of the ball around an object [m]; unused for geoms.
         thickness: Half of what is to be gone through at the thickest place [m].
@@ -35,6 +36,7 @@ class Part:
     """
 
     middle: vec3
+    half: vec3
     scale: vec3
     radius: real
     thickness: real
@@ -53,6 +55,9 @@ class PartIndex:
     first_block: wp.int32  # Of its samples
     blocks: wp.int32  # How many it has; none where its samples are not asked
     first_run: wp.int32  # Of runs of its blocks
+    first_corner_block: wp.int32  # Of a polyhedron's corners, which are asked against half-spaces
+    corner_blocks: wp.int32  # How many of these there are; none for what is no polyhedron
+    first_corner_run: wp.int32  # Of runs of these
     turning: wp.int32  # How its samples turn
     solid: wp.int32  # Kind of its solid, see `dano.mujoco.kernels.solids`; −1 for none
     at: wp.int32  # Leaf of a solid of `dano.physics`, first plane of a hull, height field
@@ -189,8 +194,7 @@ class Touch:
         area: What of the sample's area faces the other body [m²].
         score: How much it counts as a head of others, see `dano.mujoco.kernels.merging`.
         precedence: See `Known`.
-        kept: Share of its weight that it keeps.
-        drawn: How much heads draw it; both see `dano.mujoco.kernels.merging`.
+        kept: Share of its weight that it keeps, see `dano.mujoco.kernels.merging`.
         presses: 0 where it only counts as near.
         flat: 1 where the normal is that of a flat face of an object, 2 where what is round presses on it.
     """
@@ -205,9 +209,33 @@ class Touch:
     score: real
     precedence: real
     kept: real
-    drawn: real
     presses: wp.int32
     flat: wp.int32
+
+
+@wp.struct
+class Led:
+    """What a head stands for, summed over its shares w of the loads of samples; arms are from the head on.
+
+    Attributes:
+        weight: Σ w [m³].
+        squares: Σ w² over shares of one load [m⁶].
+        force: Σ w n [m³].
+        moment: Σ w x × n [m⁴].
+        place: Σ w x [m⁴].
+        gap: Σ w · gap [m⁴].
+        nearing: Σ w · nearing [m⁴/s].
+        presses: 1 where one of them does.
+    """
+
+    weight: real
+    squares: real
+    force: vec3
+    moment: vec3
+    place: vec3
+    gap: real
+    nearing: real
+    presses: wp.int32
 
 
 @wp.struct
@@ -250,8 +278,9 @@ class Work:
     options: wp.array(dtype=Options)  # Shape (1,)
     settings: wp.array(dtype=Settings)  # Shape (k,), see `Options`
     touches: wp.array(dtype=Touch)  # Room for the samples of a pair that touch
-    scores: wp.array(dtype=real)  # Room for the highest of them, shape (most + 1,)
+    scores: wp.array(dtype=real)  # Room for the highest of them, then for what draws one, shape (most + 1,)
     heads: wp.array(dtype=wp.int32)  # Room for which of them are heads, shape (most,)
+    led: wp.array(dtype=Led)  # Room for what heads stand for, shape (most,)
     rows: wp.array(dtype=ContactRow)  # The contacts
     index: wp.array(dtype=ContactIndex)  # The same
     # Number of contacts, or −1 where sizes of geoms differ from those that are known; shape (1,).
