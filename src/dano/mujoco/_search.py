@@ -286,7 +286,7 @@ class NearSearch:
             "touches": self.touches,
             "scores": np.zeros(most + 1),
             "heads": np.zeros(most, np.int32),
-            "led": parameters.rows("work.led", most),
+            "groups": parameters.rows("work.groups", -(-most // 8)),
             "rows": self.rows,
             "index": self.wholes,
             "found": self.found,

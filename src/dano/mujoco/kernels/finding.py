@@ -27,7 +27,6 @@ from dano.physics.samples import facing_area, position_in_solid, solid_normal
 from dano.physics.solids.distances import solid_of
 from dano.physics.solids.grids import STEEPEST
 from dano.physics.solids.kinds import BOX, GRID, HALF_SPACE
-from dano.physics.solids.leaves import Distance
 
 _BLOCK, _GRID, _HALF_SPACE = wp.constant(BLOCK), wp.constant(GRID), wp.constant(HALF_SPACE)
 _RUN, _UNKNOWN = wp.constant(RUN), wp.constant(UNKNOWN)
@@ -231,13 +230,13 @@ def meeting(known: wp.ref[Known], model: wp.ref[Model], side: Side, sink: real, 
             if block < end:
                 for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
                     x = position_in_solid(pose, known.samples[s].point)
-                    d, flat = distance_with_faces(known, model, side.other, side.band, x)
-                    if d.value <= reach:
+                    value, gradient, flat = distance_with_faces(known, model, side.other, side.band, x)
+                    if value <= reach:
                         normal, flat = pressed_normal(
-                            pose, side.other.solid, known.facing[s], solid_normal(d.gradient), flat
+                            pose, side.other.solid, known.facing[s], solid_normal(gradient), flat
                         )
                         near = h * approach(pose, side.index.turning, x, normal)
-                        left = d.value + sink
+                        left = value + sink
                         # What begins deeper is no matter of this step.
                         if near > ZERO and (share > ZERO or left > ZERO):
                             if facing_area(pose, known.samples[s], normal) > ZERO:
@@ -343,19 +342,23 @@ def list_side(
                 sample = known.samples[s]
                 x = points * sample.point + origin
                 # Most samples of a near block are not near.
-                d = Distance()
+                value = real(-INFINITY)
+                gradient = vec3()
                 flat = int(0)
                 if side.other.solid == _GRID:
-                    d.value = seen - STEEPEST * wp.length(x - seen_at)
-                if d.value <= reach + side.slack:
-                    d.value = quick_clearance(known, side.other, x, reach + side.slack)
-                    seen = d.value
+                    value = seen - STEEPEST * wp.length(x - seen_at)
+                if value <= reach + side.slack:
+                    # Beside what is near, most are: their values are not asked without gradients.
+                    enough = wp.where(seen > reach + side.slack, reach + side.slack, real(-INFINITY))
+                    value = quick_clearance(known, side.other, x, enough)
+                    seen = value
                     seen_at = x
-                if d.value <= reach + side.slack:
-                    d, flat = distance_with_faces(known, model, side.other, side.band, x)
-                if d.value <= reach:
+                if value <= reach + side.slack:
+                    value, gradient, flat = distance_with_faces(known, model, side.other, side.band, x)
+                    seen = value
+                if value <= reach:
                     normal, flat = pressed_normal(
-                        pose, side.other.solid, known.facing[s], solid_normal(d.gradient), flat
+                        pose, side.other.solid, known.facing[s], solid_normal(gradient), flat
                     )
                     area = facing_area(pose, sample, normal)
                     # Finer samples say better where what is round presses on a face.
@@ -363,7 +366,7 @@ def list_side(
                         area = ZERO
                     # Samples on the far side of a thin body do not press.
                     if area > ZERO:
-                        touch = side_touch(side, pose, start, x, normal, d.value)
+                        touch = side_touch(side, pose, start, x, normal, value)
                         over = touch.gap - margin + gap
                         end = over - h * touch.nearing
                         early = fast and end < -sink
@@ -382,7 +385,7 @@ def list_side(
                             if flat == 2 or (flat == 1 and known.rim[s] == 0 and not on_face):
                                 own = pose.points * sample.area
                                 if flat == 2:
-                                    own = -solid_normal(d.gradient)
+                                    own = -solid_normal(gradient)
                                 if side.index.turning == 0 or flat == 2:
                                     touch.flat = 2
                                     touch.slope = start.turn * slope_of(own, normal)

@@ -19,12 +19,13 @@ from dano.mujoco.kernels.mixing import held_back, in_parallel, softened
 from dano.mujoco.kernels.tables import (
     ContactIndex,
     ContactRow,
-    Led,
+    Heads,
     Options,
     PartIndex,
     Settings,
     Touch,
     vec2,
+    vec8,
     vec9,
     Work,
 )
@@ -235,21 +236,6 @@ def spread_of(touches: wp.array(dtype=Touch), begin: int, end: int) -> real:
     return second / weight
 
 
-@wp.func(inline=True)
-def pull(kept: real, arm: vec3, cosine: real, near: real) -> real:
-    """How much of a sample a head draws, beside others.
-
-    Args:
-        kept: Of the head.
-        arm: From the head to the sample [m].
-        cosine: Of the angle between their normals.
-        near: ε² [m²].
-    """
-    facing = wp.max(ONE + cosine, _AGAINST)
-    closeness = facing / (near + wp.dot(arm, arm))
-    return kept * closeness * closeness
-
-
 @wp.func
 def find_heads(work: wp.ref[Work], begin: int, end: int, most: int) -> int:
     """Say of each sample what it keeps, and list heads; how many."""
@@ -267,41 +253,91 @@ def find_heads(work: wp.ref[Work], begin: int, end: int, most: int) -> int:
 
 
 @wp.func
-def gather(work: wp.ref[Work], begin: int, end: int, heads: int, near: real):
-    """Give each sample's load to the heads: see `Led`."""
+def group_heads(work: wp.ref[Work], heads: int) -> int:
+    """Write heads in groups, and how many groups."""
+    groups = (heads + 7) // 8
+    for g in range(groups):
+        work.groups[g] = Heads()
     for k in range(heads):
-        work.led[k] = Led()
+        head = work.heads[k]
+        g = k // 8
+        j = k - 8 * g
+        work.groups[g].x[j] = work.touches[head].position[0]
+        work.groups[g].y[j] = work.touches[head].position[1]
+        work.groups[g].z[j] = work.touches[head].position[2]
+        work.groups[g].normal_x[j] = work.touches[head].normal[0]
+        work.groups[g].normal_y[j] = work.touches[head].normal[1]
+        work.groups[g].normal_z[j] = work.touches[head].normal[2]
+        work.groups[g].kept[j] = work.touches[head].kept
+    return groups
+
+
+@wp.func
+def set_pulls(work: wp.ref[Work], groups: int, touch: Touch, near: real) -> real:
+    """Say how much each head draws a sample, beside others; and all of them together. `near`: ε² [m²]."""
+    one = vec8(ONE)
+    total = ZERO
+    for g in range(groups):
+        x = vec8(touch.position[0]) - work.groups[g].x
+        y = vec8(touch.position[1]) - work.groups[g].y
+        z = vec8(touch.position[2]) - work.groups[g].z
+        cosine = (
+            touch.normal[0] * work.groups[g].normal_x
+            + touch.normal[1] * work.groups[g].normal_y
+            + touch.normal[2] * work.groups[g].normal_z
+        )
+        facing = wp.max(one + cosine, vec8(_AGAINST))
+        apart = vec8(near) + wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
+        closeness = wp.cw_div(facing, apart)
+        pulls = wp.cw_mul(work.groups[g].kept, wp.cw_mul(closeness, closeness))
+        work.groups[g].pulls = pulls
+        total += wp.dot(pulls, one)
+    return total
+
+
+@wp.func
+def give(work: wp.ref[Work], group: int, touch: Touch, shares: vec8):
+    """Add shares of a sample to what heads stand for."""
+    n = touch.normal
+    x = vec8(touch.position[0]) - work.groups[group].x
+    y = vec8(touch.position[1]) - work.groups[group].y
+    z = vec8(touch.position[2]) - work.groups[group].z
+    w = touch.weight * shares
+    work.groups[group].weight += w
+    work.groups[group].squares += touch.weight * w
+    work.groups[group].force_x += n[0] * w
+    work.groups[group].force_y += n[1] * w
+    work.groups[group].force_z += n[2] * w
+    work.groups[group].moment_x += wp.cw_mul(w, n[2] * y - n[1] * z)
+    work.groups[group].moment_y += wp.cw_mul(w, n[0] * z - n[2] * x)
+    work.groups[group].moment_z += wp.cw_mul(w, n[1] * x - n[0] * y)
+    work.groups[group].place_x += wp.cw_mul(w, x)
+    work.groups[group].place_y += wp.cw_mul(w, y)
+    work.groups[group].place_z += wp.cw_mul(w, z)
+    work.groups[group].gap += touch.gap * w
+    work.groups[group].nearing += touch.nearing * w
+
+
+@wp.func
+def gather(work: wp.ref[Work], begin: int, end: int, heads: int, near: real) -> int:
+    """Give all that samples do not keep to the heads; 1 if one of them presses."""
+    groups = group_heads(work, heads)
+    presses = int(0)
+    own = int(0)
     for i in range(begin, end):
-        position = work.touches[i].position
-        normal = work.touches[i].normal
-        load = work.touches[i].weight
-        gap = work.touches[i].gap
-        nearing = work.touches[i].nearing
-        presses = work.touches[i].presses
-        own = work.touches[i].kept
-        drawn = ZERO
-        for k in range(heads):
-            head = work.heads[k]
-            arm = position - work.touches[head].position
-            cosine = wp.dot(normal, work.touches[head].normal)
-            work.scores[k] = pull(work.touches[head].kept, arm, cosine, near)
-            drawn += work.scores[k]
-        left = (ONE - own) / drawn
-        for k in range(heads):
-            head = work.heads[k]
-            arm = position - work.touches[head].position
-            w = left * work.scores[k]
-            if i == head:
-                w += own
-            work.led[k].squares += w * load * load
-            w = w * load
-            work.led[k].weight += w
-            work.led[k].force += w * normal
-            work.led[k].moment += w * wp.cross(arm, normal)
-            work.led[k].place += w * arm
-            work.led[k].gap += w * gap
-            work.led[k].nearing += w * nearing
-            work.led[k].presses = wp.max(work.led[k].presses, presses)
+        touch = work.touches[i]
+        presses = wp.max(presses, touch.presses)
+        left = (ONE - touch.kept) / set_pulls(work, groups, touch, near)
+        # Heads are in the order of samples.
+        is_head = own < heads and work.heads[wp.min(own, heads - 1)] == i
+        for g in range(groups):
+            shares = left * work.groups[g].pulls
+            if is_head and own // 8 == g:
+                shares[own - 8 * g] += touch.kept
+            give(work, g, touch, shares)
+        if is_head:
+            own += 1
+    return presses
 
 
 @wp.func
@@ -316,24 +352,30 @@ def tangents(n: vec3) -> vec9:
 
 
 @wp.func
-def led_touch(head: Touch, led: Led) -> tuple[Touch, real]:
+def led_touch(work: wp.ref[Work], number: int, presses: int) -> tuple[Touch, real]:
     """One touch for the share of a head, and the number of samples that it stands for, (Σw)²/Σw².
 
-    Its weight times its normal is their force. It presses if one of them does.
+    Its weight times its normal is their force. It presses if one of them does: each has a share of all.
     """
-    merged = head
-    merged.presses = wp.max(merged.presses, led.presses)
-    squared = wp.dot(led.force, led.force)
+    g = number // 8
+    k = number - 8 * g
+    merged = work.touches[work.heads[number]]
+    merged.presses = presses
+    weight = work.groups[g].weight[k]
+    force = vec3(work.groups[g].force_x[k], work.groups[g].force_y[k], work.groups[g].force_z[k])
+    moment = vec3(work.groups[g].moment_x[k], work.groups[g].moment_y[k], work.groups[g].moment_z[k])
+    squared = wp.dot(force, force)
     # Where normals oppose each other, no one contact does what they do, and the head stands for itself.
-    if squared > HALF * HALF * led.weight * led.weight:
-        place = led.place / led.weight
-        moment = led.moment - wp.cross(place, led.force)
+    if squared > HALF * HALF * weight * weight:
+        place = vec3(work.groups[g].place_x[k], work.groups[g].place_y[k], work.groups[g].place_z[k])
+        place = place / weight
+        moment -= wp.cross(place, force)
         merged.weight = wp.sqrt(squared)
-        merged.position += place + wp.cross(led.force, moment) / squared
-        merged.normal = led.force / merged.weight
-        merged.gap = led.gap / led.weight
-        merged.nearing = led.nearing / led.weight
-    return merged, led.weight * led.weight / led.squares
+        merged.position += place + wp.cross(force, moment) / squared
+        merged.normal = force / merged.weight
+        merged.gap = work.groups[g].gap[k] / weight
+        merged.nearing = work.groups[g].nearing[k] / weight
+    return merged, weight * weight / work.groups[g].squares[k]
 
 
 @wp.func
@@ -407,9 +449,9 @@ def merge(
     set_scores(work, begin, end, flat == 1)
     heads = find_heads(work, begin, end, most)
     near = _SPREAD * spread_of(work.touches, begin, end) / real(most)
-    gather(work, begin, end, heads, near)
+    presses = gather(work, begin, end, heads, near)
     for k in range(heads):
-        touch, samples = led_touch(work.touches[work.heads[k]], work.led[k])
+        touch, samples = led_touch(work, k, presses)
         touch = lowest(touch, bulge)
         write(
             work,

@@ -69,17 +69,14 @@ def height_distance(model: Model, field: int, x: vec3) -> Distance:
     return d
 
 
-@wp.func(inline=True)
+@wp.func
 def part_distance(known: Known, model: Model, part: PartIndex, x: vec3) -> Distance:
     """Signed distance of a part's solid, and its gradient, at a point of its frame [m]."""
-    d = Distance()
     if part.solid == _HULL:
-        d = hull_distance(known, part, x)
-    elif part.solid == _HEIGHTS:
-        d = height_distance(model, part.at, x)
-    else:
-        d = leaf_distance(known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x)
-    return d
+        return hull_distance(known, part, x)
+    if part.solid == _HEIGHTS:
+        return height_distance(model, part.at, x)
+    return leaf_distance(known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x)
 
 
 @wp.func(inline=True)
@@ -91,14 +88,14 @@ def beyond(plane: vec4, x: vec3) -> real:
 @wp.func
 def distance_with_faces(
     known: wp.ref[Known], model: wp.ref[Model], part: PartIndex, band: real, x: vec3
-) -> tuple[Distance, int]:
+) -> tuple[real, vec3, int]:
     """`part_distance`, by the flat faces of an object where one of them is nearest; 1 if one is.
 
     Below or above a face, and nearer to its plane than to its edges, the distance is that of the plane. Where
     edges are nearer, what the grid rounds does not make it deeper than the plane.
     """
-    d = Distance()
-    d.value = real(INFINITY)
+    value = real(INFINITY)
+    gradient = vec3()
     deepest = real(-INFINITY)
     of_deepest = vec3()
     for f in range(part.first_face, part.first_face + part.faces):
@@ -109,26 +106,28 @@ def distance_with_faces(
             for k in range(face.first, face.first + face.count):
                 aside = wp.max(aside, beyond(known.edges[k], x))
             if aside <= wp.min(height, ZERO):
-                if height < d.value:
-                    d.value = height
-                    d.gradient = vec3(face.plane[0], face.plane[1], face.plane[2])
+                if height < value:
+                    value = height
+                    gradient = vec3(face.plane[0], face.plane[1], face.plane[2])
             elif aside < band and height <= ZERO and height > deepest:
                 deepest = height
                 of_deepest = vec3(face.plane[0], face.plane[1], face.plane[2])
     flat = int(1)
-    if d.value == real(INFINITY):
+    if value == real(INFINITY):
         flat = 0
         d = part_distance(known, model, part, x)
-        if d.value < deepest:
-            d.value = deepest
-            d.gradient = of_deepest
+        value = d.value
+        gradient = d.gradient
+        if value < deepest:
+            value = deepest
+            gradient = of_deepest
             flat = 1
-    return d, flat
+    return value, gradient, flat
 
 
 @wp.func(inline=True)
 def grid_bound(known: Known, part: PartIndex, x: vec3, enough: real) -> real:
-    """`part_distance` of an object [m], or a lower bound that exceeds `enough`: of a few cells, and the way."""
+    """`part_distance` of an object [m], or a lower bound beyond `enough`: of a few cells, and the way."""
     leaf = known.solids.leaves[0, part.at]
     kind = known.solids.kinds[part.at]
     u = place_in_grid(leaf, (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position)))
@@ -176,8 +175,9 @@ def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3, enough:
         bound = quick_clearance(known, part, x, enough)
     elif part.solid == _BOX:
         bound = quick_clearance(known, part, x, enough)
-        if bound <= enough:
-            bound = part_distance(known, model, part, x).value
+        if bound > ZERO:
+            half = known.solids.leaves[0, part.at].sizes
+            bound = wp.length(wp.max(vec3(wp.abs(x[0]), wp.abs(x[1]), wp.abs(x[2])) - half, vec3()))
     else:
         bound = leaf_clearance(
             known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x, enough

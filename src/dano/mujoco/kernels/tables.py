@@ -17,6 +17,7 @@ RUN = 8
 
 vec2 = wp.types.vector(length=2, dtype=real)
 vec5 = wp.types.vector(length=5, dtype=real)
+vec8 = wp.types.vector(length=8, dtype=real)
 vec9 = wp.types.vector(length=9, dtype=real)
 
 
@@ -214,28 +215,54 @@ class Touch:
 
 
 @wp.struct
-class Led:
-    """What a head stands for, summed over its shares w of the loads of samples; arms are from the head on.
+class Heads:
+    """Eight heads, and what they stand for: sums over their shares w of loads. Arms are from the head on.
 
     Attributes:
+        x: Where they are [m, W], by axis.
+        y: …
+        z: …
+        normal_x: Their normals [W], by axis.
+        normal_y: …
+        normal_z: …
+        kept: What they keep of their own load, 0 where there is no head.
+        pulls: How much they draw a sample.
         weight: Σ w [m³].
-        squares: Σ w² over shares of one load [m⁶].
-        force: Σ w n [m³].
-        moment: Σ w x × n [m⁴].
-        place: Σ w x [m⁴].
+        squares: Σ w · load, with the whole load [m⁶].
+        force_x: Σ w n [m³], by axis.
+        force_y: …
+        force_z: …
+        moment_x: Σ w arm × n [m⁴], by axis.
+        moment_y: …
+        moment_z: …
+        place_x: Σ w arm [m⁴], by axis.
+        place_y: …
+        place_z: …
         gap: Σ w · gap [m⁴].
         nearing: Σ w · nearing [m⁴/s].
-        presses: 1 where one of them does.
     """
 
-    weight: real
-    squares: real
-    force: vec3
-    moment: vec3
-    place: vec3
-    gap: real
-    nearing: real
-    presses: wp.int32
+    x: vec8
+    y: vec8
+    z: vec8
+    normal_x: vec8
+    normal_y: vec8
+    normal_z: vec8
+    kept: vec8
+    pulls: vec8
+    weight: vec8
+    squares: vec8
+    force_x: vec8
+    force_y: vec8
+    force_z: vec8
+    moment_x: vec8
+    moment_y: vec8
+    moment_z: vec8
+    place_x: vec8
+    place_y: vec8
+    place_z: vec8
+    gap: vec8
+    nearing: vec8
 
 
 @wp.struct
@@ -278,9 +305,9 @@ class Work:
     options: wp.array(dtype=Options)  # Shape (1,)
     settings: wp.array(dtype=Settings)  # Shape (k,), see `Options`
     touches: wp.array(dtype=Touch)  # Room for the samples of a pair that touch
-    scores: wp.array(dtype=real)  # Room for the highest of them, then for what draws one, shape (most + 1,)
+    scores: wp.array(dtype=real)  # Room for the highest of them, shape (most + 1,)
     heads: wp.array(dtype=wp.int32)  # Room for which of them are heads, shape (most,)
-    led: wp.array(dtype=Led)  # Room for what heads stand for, shape (most,)
+    groups: wp.array(dtype=Heads)  # Room for them, eight in a group
     rows: wp.array(dtype=ContactRow)  # The contacts
     index: wp.array(dtype=ContactIndex)  # The same
     # Number of contacts, or −1 where sizes of geoms differ from those that are known; shape (1,).
