@@ -348,8 +348,11 @@ def list_side(
                 if side.other.solid == _GRID:
                     value = seen - STEEPEST * wp.length(x - seen_at)
                 if value <= reach + side.slack:
-                    # Beside what is near, most are: their values are not asked without gradients.
-                    enough = wp.where(seen > reach + side.slack, reach + side.slack, real(-INFINITY))
+                    # Beside what is near, most are: their values are not asked without gradients. Nor are
+                    # those beside flat faces, where they are less exact than planes.
+                    enough = real(-INFINITY)
+                    if side.other.faces == 0 and seen > reach:
+                        enough = reach
                     value = quick_clearance(known, side.other, x, enough)
                     seen = value
                     seen_at = x

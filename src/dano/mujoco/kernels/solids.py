@@ -94,8 +94,8 @@ def distance_with_faces(
     Below or above a face, and nearer to its plane than to its edges, the distance is that of the plane. Where
     edges are nearer, what the grid rounds does not make it deeper than the plane.
     """
-    value = real(INFINITY)
-    gradient = vec3()
+    d = Distance()
+    d.value = real(INFINITY)
     deepest = real(-INFINITY)
     of_deepest = vec3()
     for f in range(part.first_face, part.first_face + part.faces):
@@ -106,23 +106,21 @@ def distance_with_faces(
             for k in range(face.first, face.first + face.count):
                 aside = wp.max(aside, beyond(known.edges[k], x))
             if aside <= wp.min(height, ZERO):
-                if height < value:
-                    value = height
-                    gradient = vec3(face.plane[0], face.plane[1], face.plane[2])
+                if height < d.value:
+                    d.value = height
+                    d.gradient = vec3(face.plane[0], face.plane[1], face.plane[2])
             elif aside < band and height <= ZERO and height > deepest:
                 deepest = height
                 of_deepest = vec3(face.plane[0], face.plane[1], face.plane[2])
     flat = int(1)
-    if value == real(INFINITY):
+    if d.value == real(INFINITY):
         flat = 0
         d = part_distance(known, model, part, x)
-        value = d.value
-        gradient = d.gradient
-        if value < deepest:
-            value = deepest
-            gradient = of_deepest
+        if d.value < deepest:
+            d.value = deepest
+            d.gradient = of_deepest
             flat = 1
-    return value, gradient, flat
+    return d.value, d.gradient, flat
 
 
 @wp.func(inline=True)
