@@ -255,6 +255,9 @@ def _parts(like: Parameters, parts: Sequence[Part], at: Sequence[int]):
         if thing is not None:
             row["middle"], row["radius"], row["thickness"] = thing.middle, thing.radius, thing.thickness
             row["half"] = thing.half
+            if thing.corners is not None:
+                corners = np.count_nonzero(thing.corners.vectors.any(axis=1))
+                row["corner_share"] = len(thing.obj.surface.points) / corners
             whole["contype"], whole["conaffinity"] = thing.bits
             row["band"], row["slack"] = thing.faces.band(thing.thickness), thing.faces.slack
             whole["faces"] = len(thing.faces.faces)

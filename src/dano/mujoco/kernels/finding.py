@@ -445,11 +445,14 @@ def list_pair(
     side = Side()
     side.index = known.index[second]
     side.other = known.index[first]
+    # Samples for which one stands that is asked.
+    each = ONE
     # Of a polyhedron nothing is deeper in a half-space than a corner.
     if side.other.solid == _HALF_SPACE and side.index.corner_blocks > 0:
         side.index.first_block = side.index.first_corner_block
         side.index.first_run = side.index.first_corner_run
         side.index.blocks = side.index.corner_blocks
+        each = known.parts[second].corner_share
     settings = pair_settings(known, model, options, work.settings, world, pair)
     if settings.dim == ZERO:
         return begin
@@ -504,7 +507,7 @@ def list_pair(
         both = list_side(known, model, work, flipped, settings.margin, settings.gap, sink, way, h, n)
     if both == 0:
         return begin
-    return merge(work, begin, 0, both, options, settings, side.other, side.index, sink)
+    return merge(work, begin, 0, both, each, options, settings, side.other, side.index, sink)
 
 
 @wp.kernel(enable_backward=False)

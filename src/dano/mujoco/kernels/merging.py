@@ -428,22 +428,24 @@ def merge(
     at: int,
     begin: int,
     end: int,
+    each: real,
     options: Options,
     settings: Settings,
     a: PartIndex,
     b: PartIndex,
     sink: real,
 ) -> int:
-    """Write touches as contacts, from a row on; the row beyond the last."""
+    """Write touches as contacts, from a row on; the row beyond the last. Each stands for so many samples."""
     most = int(options.most)
     bulge = Bulge()
     flat = flatness(work.touches, begin, end)
     if flat == 2:
         bulge = bulge_of(work, begin, end)
     if end - begin <= most:
+        fitted = in_parallel(settings, each, each > ONE)
         for i in range(begin, end):
             touch = lowest(work.touches[i], bulge)
-            write(work, at, touch, touch.presses == 1, settings, a, b, sink, options)
+            write(work, at, touch, touch.presses == 1, fitted, a, b, sink, options)
             at += 1
         return at
     set_scores(work, begin, end, flat == 1)
@@ -458,7 +460,7 @@ def merge(
             at,
             touch,
             touch.presses == 1,
-            in_parallel(settings, samples, flat == 1),
+            in_parallel(settings, samples * each, flat == 1 or each > ONE),
             a,
             b,
             sink,

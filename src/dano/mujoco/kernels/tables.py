@@ -34,6 +34,7 @@ class Part:
         band: How far from their planes the flat faces of an object say its distance [m].
         slack: How much less than the sampled distance that may be [m].
         grain: Area of one of its samples [m²].
+        corner_share: Samples for which one of a polyhedron's corners stands.
     """
 
     middle: vec3
@@ -44,6 +45,7 @@ class Part:
     band: real
     slack: real
     grain: real
+    corner_share: real
 
 
 @wp.struct
