@@ -1,4 +1,4 @@
-"""A robot of each family on a floor, held by servos, with its own collision meshes; beside MuJoCo."""
+"""Robots of five families on a floor, held by servos, with their own collision meshes; beside MuJoCo."""
 
 import dataclasses
 import importlib.util
@@ -48,6 +48,13 @@ _CASES = (
         "a1/a1.urdf",
         True,
         {f"{leg}_{part}_joint": q for leg in _LEGS for part, q in (("upper", 0.8), ("lower", -1.6))},
+    ),
+    _Case(
+        "quadruped (Go1)",
+        "cmeel",
+        "go1_description/urdf/go1.urdf",
+        True,
+        {f"{leg}_{part}_joint": q for leg in _LEGS for part, q in (("thigh", 0.8), ("calf", -1.6))},
     ),
     _Case("humanoid (G1)", "cmeel", "g1_description/urdf/g1_29dof_rev_1_0.urdf", True, {}),
     _Case("mobile base (Husky)", "pybullet_data", "husky/husky.urdf", True, {}),
