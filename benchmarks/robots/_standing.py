@@ -25,6 +25,8 @@ _FAST = 50.0
 """Stiffness over damping of the servos [1/s]."""
 _ABOVE = 1e-3
 """Height from which robots that float are set down [m]."""
+_LIGHT = 1e-6
+"""Mass of links that are only there to have a name [kg]."""
 _EXAMPLES = "cmeel.prefix/share/example-robot-data/robots"
 _LEGS = ("FL", "FR", "RL", "RR")
 
@@ -191,6 +193,10 @@ def _in_mujoco(
         spec = mujoco.MjSpec.from_file(str(path))
     # Some moments exceed the sum of the others by a rounding of the file.
     spec.compiler.balanceinertia = True
+    # The root of Go1, of 1 mg, has moments that no body can have, which MuJoCo refuses.
+    for body in spec.bodies[1:]:
+        if body.mass <= _LIGHT:
+            body.fullinertia = [1e-3 * _LIGHT] * 3 + [0.0] * 3
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [1, 1, 1], "contype": 2, "conaffinity": 1}
