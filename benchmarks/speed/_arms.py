@@ -105,7 +105,7 @@ def strikes() -> Arm:
     weld = dano.Joint(robot.bodies[-1].name, "tool", "weld", position=(0, 0, REACH))
     params = dano.ContactParams(sliding_friction=FRICTION)
     scene = dano.Scene.create(
-        [*robot.bodies, tool, box, floor],
+        [box, *robot.bodies, tool, floor],
         [dano.Contact("box", "floor", params), dano.Contact("tool", "box", params)],
         joints=[*robot.joints, weld],
         timestep=TIMESTEP,
