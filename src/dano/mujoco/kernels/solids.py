@@ -70,7 +70,7 @@ def height_distance(model: Model, field: int, x: vec3) -> Distance:
 
 
 @wp.func
-def part_distance(known: Known, model: Model, part: PartIndex, x: vec3) -> Distance:
+def part_distance(known: wp.ref[Known], model: wp.ref[Model], part: PartIndex, x: vec3) -> Distance:
     """Signed distance of a part's solid, and its gradient, at a point of its frame [m]."""
     if part.solid == _HULL:
         return hull_distance(known, part, x)
