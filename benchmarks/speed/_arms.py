@@ -110,7 +110,7 @@ def strikes() -> Arm:
         joints=[*robot.joints, weld],
         timestep=TIMESTEP,
     )
-    beside = {"position": (0.5, TOOL + HALF + 0.02, HALF)}
+    beside: dict[str, Numbers] = {"position": (0.5, TOOL + HALF + 0.02, HALF)}
     state, q = _reaching(robot, scene, (0.5, 0.0, HALF), box=beside)
     q[robot.bodies[0].name] += 0.4
     return Arm("Panda strikes a box", scene, state, _told(scene, q))
@@ -140,7 +140,7 @@ def holds() -> Arm:
         joints=[*robot.joints, *slides],
         timestep=TIMESTEP,
     )
-    place = {"position": (0.5, 0.0, 0.3)}
+    place: dict[str, Numbers] = {"position": (0.5, 0.0, 0.3)}
     state, q = _reaching(robot, scene, (0.5, 0.0, 0.3), box=place)
     control = _told(scene, q, left={"effort": FORCE}, right={"effort": FORCE})
     settled = dano.simulate(scene, state, controls=_repeated(control, SETTLE)).states
