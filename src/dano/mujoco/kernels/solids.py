@@ -173,7 +173,7 @@ def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3, enough:
         bound = quick_clearance(known, part, x, enough)
     elif part.solid == _BOX:
         bound = quick_clearance(known, part, x, enough)
-        if bound > ZERO:
+        if bound > ZERO and bound <= enough:
             half = known.solids.leaves[0, part.at].sizes
             bound = wp.length(wp.max(vec3(wp.abs(x[0]), wp.abs(x[1]), wp.abs(x[2])) - half, vec3()))
     else:
