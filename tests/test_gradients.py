@@ -84,7 +84,7 @@ def test_functions_that_look_at_what_they_hold_are_not_compiled():
 
 
 def test_forward_mode_and_single_precision():
-    forward = check(lambda x: jnp.sum(x**3), jnp.array([1.0, 2.0]), mode="forward")
+    forward = check(lambda x: jnp.sum(x**3), jnp.array([1.0, 2.0]), gradient="forward")
     np.testing.assert_allclose([line.derivative for line in forward.lines], [3, 12])
     single = check(lambda x: 1000 + jnp.sin(x), np.float32(0.5), steps=(1e-2, 1e-4))
     # A step of 5e-5 changes 1000 by less than single precision shows.
@@ -97,7 +97,7 @@ def test_forward_mode_and_single_precision():
         ({"steps": (0.0,)}, "each of steps must be finite and > 0, got 0"),
         ({"steps": ()}, "steps must be a list"),
         ({"points": 8}, "points must be odd"),
-        ({"mode": "both"}, "mode must be one of reverse, forward"),
+        ({"gradient": "both"}, "gradient must be one of reverse, forward"),
         ({"scale": -1.0}, "scale must be finite and > 0"),
         ({"labels": ["a", "b"]}, "labels must be 1"),
         ({"gradient": (1.0, 2.0)}, "gradient must be of the structure of x"),

@@ -83,18 +83,30 @@ def _names_of(module: Path) -> int:
 
 def test_the_map_of_contributing_leads_somewhere():
     text = (SOURCE.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    table = text.split("## Where is what")[1].split("## Rules")[0]
+    table = text.split("## Where things are")[1].split("## Rules")[0]
     rows = [line for line in table.splitlines() if line.startswith("| ") and "`" in line]
     assert len(rows) >= 9
     root = SOURCE / "dano"
     for row in rows:
-        folder = root
+        # What has no folder lies in the one named before, or in the first of the row.
+        folder, room = root, None
         for place in re.findall(r"`([\w/]+(?:\.py|/))`", row):
-            # A file without a folder lies in the one named before.
-            here = folder / place
-            path = here if "/" not in place and here.exists() else root / place
-            assert path.exists(), row
+            places = [each / place for each in (folder, room or root, root, SOURCE.parent)]
+            path = next((each for each in places if each.exists()), None)
+            assert path is not None, row
             folder = path if path.is_dir() else path.parent
+            room = room or folder
+
+
+def test_the_stages_of_a_step_name_modules():
+    page = SOURCE.parent / "docs" / "theory" / "step.md"
+    table = page.read_text(encoding="utf-8").split("| stage |")[1].split("\n\n")[0]
+    for row in table.splitlines()[2:]:
+        _, stage, _, formulas, loops, _ = row.split("|")
+        for package, names in (("physics", formulas), ("engine/kernels", loops)):
+            for name in re.findall(r"`(\w+)`", names):
+                place = SOURCE / "dano" / package / name
+                assert place.is_dir() or place.with_suffix(".py").is_file(), (stage, name)
 
 
 def test_no_modules_import_each_other_in_a_circle():

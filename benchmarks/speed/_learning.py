@@ -12,15 +12,12 @@ import optax
 
 from benchmarks._measure import REPOSITORY, Row, skipped
 from benchmarks.speed._cases import Case
-from dano.fields import HashGrid
 from dano.vision import (
     AbstractModel,
     Appearance,
     Capture,
     DensityModel,
-    HashModel,
     load_capture,
-    OSF,
     Rays,
     Sampling,
     see,
@@ -35,8 +32,6 @@ RENDERING = "Rendering of learned fields (96 + 32 sections, 8 colours)"
 TRAINING = "Training of learned fields, steps of Adam (48 + 16 sections, 5 colours)"
 TO_QUALITY = "Photographs to 28 dB"
 
-RELEASE = Sampling(64, 128, 128)
-"""Sections of the paper's authors' code, all of them coloured."""
 _STEP = Sampling(48, 16, 5)
 _QUALITY = 28.0
 _SPACING = 96
@@ -61,14 +56,10 @@ def learning_cases(capture: Capture) -> list[Case]:
         cases.append(
             Case(TRAINING, f"{name} trained", call, count, unit="rays/s", compile_seconds=seconds, note=note)
         )
-    network, few = models["network 8 × 256"][0], _batch(rays, 64)
-    call, _ = _training(network, few, RELEASE)
-    note = "64 + 128 sections, 128 colours, as the paper's authors"
-    cases.append(Case(TRAINING, "network 8 × 256 trained, finely", call, 64, unit="rays/s", note=note))
     if importlib.util.find_spec("torch") is not None:
         from benchmarks.speed._torch_osf import torch_calls
 
-        drawing, training = torch_calls(few)
+        drawing, training = torch_calls(_batch(rays, 64))
         cases.append(
             Case(RENDERING, "PyTorch 8 × 256 drawn", drawing, 64, unit="rays/s", note="64 + 128 sections")
         )
@@ -100,16 +91,11 @@ def quality_rows(capture: Capture, *, quick: bool) -> list[Row]:
 
 def _models(found) -> dict[str, tuple[AbstractModel, int]]:
     """What is compared, and how many rays go through it at once."""
-    box, keys = found.box, jax.random.split(jax.random.key(0), 4)
-    look = Appearance.create(box, lit=True, key=keys[0])
-    bounds = np.stack([box.origin, box.upper])
-    # The table and levels of the smallest of instant-ngp's settings that resolve what the grids do.
-    grid = HashGrid.create(n_levels=12, coarsest=8, finest=_SPACING, log2_table=15, key=keys[1])
+    box = found.box
+    look = Appearance.create(box, lit=True, key=jax.random.key(0))
     return {
         "surface grid": (SurfaceModel.create(found.hull, box, look), 4096),
         "density grid": (DensityModel.create(found.hull < 0, box, look, 0.3), 4096),
-        "hash grid": (HashModel.create(bounds, grid, lit=True, key=keys[2]), 1024),
-        "network 8 × 256": (OSF.create(bounds, scale=0.5 * float(np.ptp(bounds)), key=keys[3]), 128),
     }
 
 

@@ -32,12 +32,10 @@ from dano.objects import (
 from dano.contact import (
     AbstractContactLaw as AbstractContactLaw,
     CentroidLaw as CentroidLaw,
-    Collider as Collider,
     ContactParams as ContactParams,
     Distance as Distance,
     distance as distance,
     DistributedLaw as DistributedLaw,
-    overlap as overlap,
     Patch as Patch,
 )
 from dano.scene import (
@@ -146,7 +144,7 @@ _scene.offer(
     "film", lambda *given, **options: _importlib.import_module("dano.report").film_run(*given, **options)
 )
 _scene.offer("show", lambda *given: _importlib.import_module("dano.report").show_run(*given))
-# Nor do fields know models of photographs.
-_fields.offer_models(lambda path: _importlib.import_module("dano.vision.radiance").model_of_file(path))
+# Nor do fields know what photographs teach.
+_fields.offer_learned(lambda path: _importlib.import_module("dano.vision.radiance").LearnedField.load(path))
 _keep_old_name("dano.identify", "dano.identification")
 _keep_old_name("dano.plan", "dano.planning")

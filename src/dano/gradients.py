@@ -28,6 +28,8 @@ _RAGGED = 0.05
 _FACTOR = 2.0
 # One-sided slopes that differ by more than this share of the larger one make a kink.
 _KINK = 0.25
+# Relative difference to the slope that counts as none.
+_TOLERANCE = 0.1
 # Roundings of a value that are no change.
 _ROUNDINGS = 16.0
 
@@ -127,10 +129,7 @@ def check(
     labels: Sequence[str] | None = None,
     points: int = 21,
     directions: int = 8,
-    tolerance: float = 0.1,
-    mode: str = "reverse",
-    gradient: Any = None,
-    seed: int = 0,
+    gradient: Any = "reverse",
 ) -> Check:
     """Say what the derivatives of a function are worth at a point.
 
@@ -149,10 +148,8 @@ def check(
         points: Places along a line, an odd number.
         directions: Largest number of lines. Up to so many coordinates have one each. More coordinates are
             looked at along so many random directions, in which each moves by plus or minus its scale.
-        tolerance: Relative difference to the slope that counts as none.
-        mode: "reverse" (`jax.grad`) or "forward" (`jax.jvp`).
-        gradient: The derivative, of the structure of `x`, where `function` is not one of JAX.
-        seed: Of random directions.
+        gradient: What is looked at: "reverse" (`jax.grad`), "forward" (`jax.jvp`), or, where `function` is
+            not one of JAX, the derivative itself, of the structure of `x`.
 
     Raises:
         ValueError: If an argument is out of range, or `x` holds no real number.
@@ -163,20 +160,20 @@ def check(
     if points % 2 == 0:
         raise ValueError(f"points must be odd, so that x is one of them, got {points}")
     checked_count("directions", directions)
-    checked_number("tolerance", tolerance, above=0)
-    checked_choice("mode", mode, MODES)
+    if isinstance(gradient, str):
+        checked_choice("gradient", gradient, MODES)
     flat = _Flat.of(function, x)
     unit = _scales(flat.parts, scale)
-    ways, names = _ways(flat, labels, directions, checked_count("seed", seed, least=0))
+    ways, names = _ways(flat, labels, directions)
     at = np.unique(np.concatenate([np.linspace(-1, 1, points) * steps[0], *([-s, s] for s in steps[1:])]))
     moves = ways * unit
     values = _evaluated(flat.call, flat.start, moves, at)
-    derivatives = _derivatives(flat, moves, mode, gradient)
+    derivatives = _derivatives(flat, moves, gradient)
     # In the unit of a coordinate by itself; along a random direction in units of the scale.
     lengths = np.where(np.sum(ways != 0, axis=1) == 1, np.sum(np.abs(moves), axis=1), 1.0)
     spacing = float(jnp.finfo(flat.start.dtype).eps)
     lines = [
-        _line(name, at, row, slope, float(length), steps, tolerance, spacing)
+        _line(name, at, row, slope, float(length), steps, spacing)
         for name, row, slope, length in zip(names, values, derivatives, lengths, strict=True)
     ]
     return Check(float(values[0][np.argmin(np.abs(at))]), steps, tuple(lines))
@@ -239,7 +236,7 @@ def _scales(parts: Any, scale: Any) -> np.ndarray:
     return found
 
 
-def _ways(flat: _Flat, labels: Sequence[str] | None, most: int, seed: int) -> tuple[np.ndarray, list[str]]:
+def _ways(flat: _Flat, labels: Sequence[str] | None, most: int) -> tuple[np.ndarray, list[str]]:
     """Directions, in units of the scale, and what they are called."""
     n = flat.start.size
     names = flat.labels if labels is None else [str(label) for label in labels]
@@ -247,7 +244,7 @@ def _ways(flat: _Flat, labels: Sequence[str] | None, most: int, seed: int) -> tu
         raise ValueError(f"labels must be {n}, one for each number of x, got {len(names)}")
     if n <= most:
         return np.eye(n), names
-    signs = np.random.default_rng(seed).choice([-1.0, 1.0], (most, n))
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (most, n))
     return signs, [f"random direction {i + 1}" for i in range(most)]
 
 
@@ -284,16 +281,16 @@ def _first_that_works(ways: Sequence[Callable[[Array], Any]], at: Array) -> Any:
     return ways[-1](at)
 
 
-def _derivatives(flat: _Flat, moves: np.ndarray, mode: str, gradient: Any) -> np.ndarray:
+def _derivatives(flat: _Flat, moves: np.ndarray, gradient: Any) -> np.ndarray:
     """Derivatives along the moves."""
-    if gradient is not None:
+    if not isinstance(gradient, str):
         if jax.tree.structure(gradient) != jax.tree.structure(flat.parts):
             raise ValueError(
                 f"gradient must be of the structure of x, {jax.tree.structure(flat.parts)}, got"
                 f" {jax.tree.structure(gradient)}"
             )
         return moves @ np.asarray(ravel_pytree(jax.tree.map(jnp.asarray, gradient))[0], float)
-    if mode == "reverse":
+    if gradient == "reverse":
         slope = jax.grad(flat.call)
         return moves @ np.asarray(_first_that_works([jax.jit(slope), slope], flat.start), float)
 
@@ -311,7 +308,6 @@ def _line(
     derivative: float,
     length: float,
     steps: tuple[float, ...],
-    tolerance: float,
     spacing: float,
 ) -> Line:
     """A line with its verdict; `derivative` is by `at`, of which one is `length` in the coordinate's unit."""
@@ -328,27 +324,27 @@ def _line(
     noise = _ROUNDINGS * spacing * float(np.max(np.abs(values))) if finite else math.nan
     line = Line(label, at, values, derivative, slopes, roughness, spread, Verdict.LOST)
     of = [number / length for number in (derivative, *slopes)]
-    verdict = _verdict(line, steps, tolerance, noise) if finite else Verdict.LOST
+    verdict = _verdict(line, steps, noise) if finite else Verdict.LOST
     return line._replace(derivative=of[0], slopes=tuple(of[1:]), verdict=verdict)
 
 
-def _verdict(line: Line, steps: tuple[float, ...], tolerance: float, noise: float) -> Verdict:
+def _verdict(line: Line, steps: tuple[float, ...], noise: float) -> Verdict:
     """See `Verdict`; derivative and slopes of the line are by distances in units of the scale."""
     _, at, values, derivative, slopes, roughness, spread, _ = line
     largest, least = steps[0], steps[-1]
     steepest = spread / (2 * largest)
-    if spread <= noise and abs(derivative) * largest <= max(noise, tolerance * spread):
+    if spread <= noise and abs(derivative) * largest <= max(noise, _TOLERANCE * spread):
         return Verdict.FLAT
     missed = abs(derivative - slopes[0])
-    if missed <= tolerance * steepest + noise / largest:
+    if missed <= _TOLERANCE * steepest + noise / largest:
         ragged = roughness > _RAGGED * spread + noise and derivative * slopes[0] > 0
         return Verdict.COARSE if ragged else Verdict.TRUE
     near = np.abs(at) <= least * (1 + 1e-9)
     inside = float(np.ptp(values[near])) / (2 * least)
     smooth = roughness <= _RIPPLE * spread + noise
-    if smooth and abs(derivative - slopes[-1]) <= tolerance * inside + noise / least:
+    if smooth and abs(derivative - slopes[-1]) <= _TOLERANCE * inside + noise / least:
         return Verdict.CURVED
-    if _bent(at, values, derivative, (least, largest), tolerance, noise):
+    if _bent(at, values, derivative, (least, largest), noise):
         return Verdict.KINK
     if smooth:
         return Verdict.WRONG
@@ -356,7 +352,7 @@ def _verdict(line: Line, steps: tuple[float, ...], tolerance: float, noise: floa
     return Verdict.COARSE if same else Verdict.ROUGH
 
 
-def _bent(at, values, derivative, steps: tuple[float, float], tolerance: float, noise: float) -> bool:
+def _bent(at, values, derivative, steps: tuple[float, float], noise: float) -> bool:
     """Whether the function has two slopes at the point, each the same at both steps, and this is one."""
 
     def value(place: float) -> float:
@@ -368,4 +364,4 @@ def _bent(at, values, derivative, steps: tuple[float, float], tolerance: float, 
         return False
     steady = all(abs(a - b) <= _KINK * apart + unsure for a, b in zip(near, far, strict=True))
     nearest = min(abs(derivative - side) for side in near)
-    return bool(steady and nearest <= 0.5 * tolerance * apart + unsure)
+    return bool(steady and nearest <= 0.5 * _TOLERANCE * apart + unsure)

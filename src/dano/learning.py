@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,15 +44,12 @@ def train_object(
     options: TrainOptions | None = None,
     *,
     downscale: int = 1,
-    views: int | None = None,
     network: str | os.PathLike[str] | None = None,
     mass: float | None = None,
     mass_density: float = 1000.0,
     table: float | None = None,
-    checkpoint: str | Path | None = None,
-    resume: bool = False,
-    previews: str | Path | None = None,
     progress: Progress | None = None,
+    **training: Any,
 ) -> LearnedObject:
     """Learn a solid object from photographs with camera poses.
 
@@ -60,17 +57,14 @@ def train_object(
         photographs: Folder or file (see `load_capture`), or what was read of one.
         options: How to train; default `TrainOptions()`.
         downscale: Average so many pixels a side into one; for files only.
-        views: Train on so many of the views only.
         network: Segmentation network (ONNX) for photographs without masks; default: a plain background, or
             what stands on the table.
         mass: Of the object [kg]; default: `mass_density` times its volume.
         mass_density: Mass per volume [kg/m³].
         table: Height z of a level table that the object stands on in the photographs [m]: nothing of it is
             below, which no photograph shows. None: it is not known.
-        checkpoint: File that the state of training is written to, also when interrupted.
-        resume: Go on from `checkpoint` if it exists.
-        previews: Folder for pictures of what has been learned so far.
         progress: Called with what is being done, and the share of it that is done, between 0 and 1.
+        **training: More arguments of `train`: `views`, `checkpoint`, `resume`, `previews`.
 
     Returns:
         The object, and the field that it was made of.
@@ -91,19 +85,8 @@ def train_object(
         photographs = checked_path("photographs", photographs)
     say = checked_progress(progress)
     capture, given = _masked(photographs, downscale, network, table, say)
-    if views is not None:
-        capture = capture.thinned(views)
-
     say("visual hull", 0.0)
-    trained = train(
-        capture,
-        options,
-        table=table,
-        checkpoint=checkpoint,
-        resume=resume,
-        progress=say,
-        previews=previews,
-    )
+    trained = train(capture, options, table=table, progress=say, **training)
     if table is not None:
         trained = trained._replace(field=trained.field.above(table))
     say("solid", 0.0)

@@ -11,7 +11,7 @@ from export.conftest import check_mass, QUICK, tensor
 import dano
 from dano.contact import ContactParams
 from dano.exchange import _export, export_object
-from dano.exchange._triangles import painted, solid_triangles
+from dano.exchange._triangles import chosen_collision, painted, solid_triangles
 from dano.exchange._urdf import roll_pitch_yaw
 from dano.maths import quat_to_matrix
 
@@ -201,7 +201,6 @@ def test_angles_give_the_rotation_back(seed):
         ({"to": []}, "at least one"),
         ({"name": "a b"}, "name must be a letter.*got 'a b'"),
         ({"name": "scene"}, "must not be 'scene'"),
-        ({"collision": "vhacd"}, "collision must be one of"),
         ({"concavity": 0.0}, r"concavity must lie in \[0.01, 1\], got 0.0"),
         ({"max_pieces": 0}, "max_pieces must be ≥ 1, got 0"),
         ({"resolution": 7}, "resolution must lie between 8 and 512"),
@@ -212,6 +211,8 @@ def test_bad_options_are_named_before_anything_is_written(thing, tmp_path, optio
     with pytest.raises(ValueError, match=message):
         export_object(thing, tmp_path / "out", **options)
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ValueError, match="collision must be one of .* got 'vhacd'"):
+        chosen_collision("vhacd", solid=True)
 
 
 def test_folder_of_others_is_left_alone(thing, tmp_path):

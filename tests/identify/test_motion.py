@@ -126,6 +126,7 @@ def test_conventions_that_contradict_the_spin_are_found(change, match):
         ({"names": ("a", "a")}, "different non-empty names"),
         ({"point": "middle"}, "com, origin"),
         ({"lag": -1.0}, "lag must be finite"),
+        ({"positions": [0.0]}, "observed must be one of .*got 'positions'; did you mean 'position'"),
         ({"covariance": np.zeros((20, 3, 3))}, r"covariance must have shape \(20, 1, 6, 6\)"),
         ({"covariance": np.tile(-np.eye(6), (20, 1, 1))}, "positive definite.*frame 0"),
         ({"position": None}, "at least one observed frame"),

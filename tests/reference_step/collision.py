@@ -232,7 +232,8 @@ def depths_of(scene, side):
     (_, size, thickness) = np.minimum(*(np.asarray(scene.bodies[k].extent)[3:] for k in (side.i, side.j)))
     thin = 0.25 * thickness
     delta = min(side.law.delta, thin)
-    return delta, max(delta, min(0.01 * size, thin)), min(0.04 * size, thin)
+    both_move = not (scene.bodies[side.i].fixed or scene.bodies[side.j].fixed)
+    return delta, max(delta, min(0.01 * size, thin)), delta if both_move else min(0.04 * size, thin)
 
 
 class Meeting(NamedTuple):

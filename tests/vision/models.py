@@ -23,8 +23,9 @@ class Fog(AbstractMedium):
         return self.corners
 
     def density_at(self, points):
-        inside = jnp.all((points >= self.bounds[0][None]) & (points <= self.bounds[1][None]), axis=1)
-        return jnp.where(inside, self.extinction, 0)
+        lower, upper = self.bounds.astype(points.dtype)
+        inside = jnp.all((points >= lower[None]) & (points <= upper[None]), axis=1)
+        return jnp.where(inside, self.extinction.astype(points.dtype), 0)
 
     def colour(self, points, view, light, view_share=1.0):
         return jnp.full_like(points, 0.5), jnp.zeros_like(points)

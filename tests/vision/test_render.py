@@ -260,3 +260,10 @@ def test_threads_get_the_blocks_that_kernels_trace():
     from dano.vision.drawing import _rays
 
     assert _rays._BLOCK == instance(_rays._FEATURES, _rays._TRACING).BLOCK
+
+
+def test_a_medium_is_a_field_with_bounds():
+    field = Fog.create((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3), 7.0).field()
+    assert float(field.density(jnp.array([0.1, -0.2, 0.05]))) == 7
+    assert float(field.density(jnp.array([0.1, -0.45, 0.0]))) == 0
+    np.testing.assert_allclose(field.bounds, [(-0.5, -0.4, -0.3), (0.5, 0.4, 0.3)], rtol=1e-6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from vision.photographs import capture, CENTRE, SEMI_AXES
 
-from dano import NeuralObject
+from dano import load_field, NeuralObject
 from dano.fields import redistanced
 from dano.vision import (
     Capture,
@@ -105,6 +105,14 @@ def test_a_saved_field_draws_the_same_picture(trained: Trained, photos: Capture,
     (tmp_path / "cut.npz").write_bytes((tmp_path / "egg.npz").read_bytes()[:1000])
     with pytest.raises(ValueError, match="cut.npz"):
         LearnedField.load(tmp_path / "cut.npz")
+    x = jnp.asarray(CENTRE + 0.02)
+    assert float(load_field(tmp_path / "egg.npz").density(x)) == float(again.density(x))
+    with pytest.raises(
+        ValueError, match=r"unknown options \['interpolation'\] for a dano-learned-field file"
+    ):
+        load_field(tmp_path / "egg.npz", interpolation="linear")
+    with pytest.raises(ValueError, match="has a box of its own"):
+        load_field(tmp_path / "egg.npz", crop=((-1, -1, -1), (1, 1, 1)))
 
 
 def test_an_interrupted_training_resumes_where_it_was(trained: Trained, photos: Capture, tmp_path: Path):

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import arg, Positional
 
 from dano.building import BuildOptions, Units, Up
+from dano.exchange import ExportOptions
 
 UNNAMED = Path("<named after the input>")
 """Stands for an output that nobody named, see `dano.cli._outputs.named`; help shows it as the default."""
@@ -249,14 +250,9 @@ class Export:
     # Formats: mjcf (MuJoCo), urdf (PyBullet, ROS), usd (Isaac, Newton), obj (meshes only).
     to: tuple[Literal["mjcf", "urdf", "usd", "obj"], ...] = ("mjcf",)
     name: str | None = None  # Of the body and the files; default: the object's file's
-    # coacd: convex decomposition; hull: convex hull; auto: the first if coacd is installed.
-    collision: Literal["auto", "coacd", "hull"] = "auto"
-    concavity: float = 0.05  # How deep a convex piece may cut across, as a share of the size
-    max_pieces: int | None = None  # Most convex pieces; default: as many as it takes
     friction: float = 0.2  # Sliding friction
     restitution: float | None = None  # Coefficient of restitution, where the format has one
-    resolution: int = 64  # Nodes along the longest axis for the visible surface
-    texture_size: int = 1024  # Texels along the picture with the colours
+    options: Annotated[ExportOptions, arg(name="")] = ExportOptions()  # How
     json: bool = False  # Print one JSON object instead of text
 
 

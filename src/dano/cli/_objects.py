@@ -42,11 +42,7 @@ def export(arguments: Export) -> None:
         contact=parameters,
         progress=progress,
         to=arguments.to,
-        collision=arguments.collision,
-        concavity=arguments.concavity,
-        max_pieces=arguments.max_pieces,
-        resolution=arguments.resolution,
-        texture_size=arguments.texture_size,
+        **vars(arguments.options),
     )
     progress.close()
     if arguments.json:

@@ -6,17 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from dano.archive import checked_output
-from dano.cli._arguments import (
-    BuildObject,
-    Compare,
-    Export,
-    FindPoses,
-    Import,
-    PlanTask,
-    Simulate,
-    Train,
-    UNNAMED,
-)
+from dano.cli import _arguments
 from dano.cli._console import say
 from dano.cli.tracking import Track
 from dano.extras import is_installed
@@ -24,14 +14,14 @@ from dano.extras import is_installed
 Options = TypeVar("Options")
 
 _NAMED_AFTER: dict[type, tuple[str, str]] = {
-    Train: ("images", ".dano"),
-    BuildObject: ("field", ".dano"),
-    Import: ("file", ".grid.npz"),
-    Simulate: ("scene", "_run.npz"),
+    _arguments.Train: ("images", ".dano"),
+    _arguments.BuildObject: ("field", ".dano"),
+    _arguments.Import: ("file", ".grid.npz"),
+    _arguments.Simulate: ("scene", "_run.npz"),
     Track: ("video", "_motion.npz"),
-    PlanTask: ("task", "_plan.npz"),
-    Export: ("object", "_export"),
-    Compare: ("object", "_meshes.html"),
+    _arguments.PlanTask: ("task", "_plan.npz"),
+    _arguments.Export: ("object", "_export"),
+    _arguments.Compare: ("object", "_meshes.html"),
 }
 """Commands with the input that their output is named after, and what is appended to its name."""
 
@@ -43,12 +33,12 @@ def named(command: Any) -> tuple[Any, str | None]:
     `dano train` looks for them. A number is appended where there is something of this name already, unless an
     earlier training is to go on.
     """
-    if getattr(command, "output", None) is not UNNAMED:
+    if getattr(command, "output", None) is not _arguments.UNNAMED:
         return command, None
     fields: Any = command
-    if isinstance(command, Simulate) and command.beside is not None:
+    if isinstance(command, _arguments.Simulate) and command.beside is not None:
         return dataclasses.replace(command, output=Path()), None
-    if isinstance(command, FindPoses):
+    if isinstance(command, _arguments.FindPoses):
         source = command.images
         folder = source.parent if source.name == "images" else source
         usual = folder / "transforms.json" if source.is_dir() else Path(f"{_stem(source)}_transforms.json")
@@ -80,7 +70,7 @@ def run_files(folder: Path, scenes: Sequence[Path], *, resume: bool) -> list[Pat
     """
     paths: list[Path] = []
     for scene in scenes:
-        usual = folder / (_stem(scene) + _NAMED_AFTER[Simulate][1])
+        usual = folder / (_stem(scene) + _NAMED_AFTER[_arguments.Simulate][1])
         paths.append(free_path(usual, taken=paths, keep=not resume))
     return paths
 

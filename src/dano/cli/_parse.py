@@ -17,21 +17,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff
 
 from dano import __version__
-from dano.cli._arguments import (
-    BuildObject,
-    Cache,
-    CheckPhotographs,
-    Compare,
-    Demo,
-    Export,
-    FindPoses,
-    Import,
-    Inspect,
-    PlanTask,
-    Simulate,
-    Train,
-    View,
-)
+from dano.cli import _arguments
 from dano.cli.checking import CheckScene
 from dano.cli.film import Film
 from dano.cli.identifying import Identify
@@ -49,25 +35,29 @@ class _Row(NamedTuple):
 
 GROUPS: dict[str, dict[str, _Row]] = {
     "Most used": {
-        "demo": _Row(Demo, "_scenes:demo", "dano demo"),
-        "train": _Row(Train, "_learn:train", "dano train photos/"),
-        "simulate": _Row(Simulate, "_scenes:simulate", "dano simulate mug.dano --video mug.mp4"),
-        "view": _Row(View, "_scenes:view", "dano view mug_run.npz"),
-        "inspect": _Row(Inspect, "_objects:inspect", "dano inspect mug.dano"),
+        "demo": _Row(_arguments.Demo, "_scenes:demo", "dano demo"),
+        "train": _Row(_arguments.Train, "_learn:train", "dano train photos/"),
+        "simulate": _Row(_arguments.Simulate, "_scenes:simulate", "dano simulate mug.dano --video mug.mp4"),
+        "view": _Row(_arguments.View, "_scenes:view", "dano view mug_run.npz"),
+        "inspect": _Row(_arguments.Inspect, "_objects:inspect", "dano inspect mug.dano"),
     },
     "From photographs and films": {
         "film": _Row(Film, "film._run:film", "dano film walk/ slide.mp4 --marker-size 0.08 -o soap.dano"),
-        "poses": _Row(FindPoses, "_learn:poses", "dano poses photos/ --marker-size 0.05"),
-        "data": _Row(CheckPhotographs, "_learn:data", "dano data photos/"),
+        "poses": _Row(_arguments.FindPoses, "_learn:poses", "dano poses photos/ --marker-size 0.05"),
+        "data": _Row(_arguments.CheckPhotographs, "_learn:data", "dano data photos/"),
         "track": _Row(Track, "tracking.run:track", "dano track throw.mp4 mug.dano --camera camera.json"),
     },
     "From fields, and to other programs": {
-        "build": _Row(BuildObject, "_objects:build", "dano build my_nerf.npz --length 0.12 --mass 0.35"),
-        "import": _Row(
-            Import, "_objects:import_field", "dano import step-000029999.ckpt --crop -1 -1 -1 1 1 1"
+        "build": _Row(
+            _arguments.BuildObject, "_objects:build", "dano build my_nerf.npz --length 0.12 --mass 0.35"
         ),
-        "export": _Row(Export, "_objects:export", "dano export mug.dano --to mjcf urdf"),
-        "compare": _Row(Compare, "_compare:compare", "dano compare mug.dano"),
+        "import": _Row(
+            _arguments.Import,
+            "_objects:import_field",
+            "dano import step-000029999.ckpt --crop -1 -1 -1 1 1 1",
+        ),
+        "export": _Row(_arguments.Export, "_objects:export", "dano export mug.dano --to mjcf urdf"),
+        "compare": _Row(_arguments.Compare, "_compare:compare", "dano compare mug.dano"),
     },
     "With scenes": {
         "check": _Row(CheckScene, "checking._run:check", "dano check scene.toml"),
@@ -76,10 +66,10 @@ GROUPS: dict[str, dict[str, _Row]] = {
             "identifying.run:identify",
             "dano identify scene.toml throw.npz -p mug,table.sliding_friction:0:1",
         ),
-        "plan": _Row(PlanTask, "planning:plan", "dano plan scene.toml task.toml --video plan.mp4"),
+        "plan": _Row(_arguments.PlanTask, "planning:plan", "dano plan scene.toml task.toml --video plan.mp4"),
     },
     "This program": {
-        "cache": _Row(Cache, "_cache:cache", "dano cache objects --limit 500MB"),
+        "cache": _Row(_arguments.Cache, "_cache:cache", "dano cache objects --limit 500MB"),
     },
 }
 """Commands in the order in which `dano --help` shows them: most used first."""

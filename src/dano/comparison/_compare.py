@@ -9,24 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dano.checks import checked_count, checked_items, checked_kind, checked_optional, checked_progress
-from dano.comparison._bodies import (
-    best_level,
-    Drop,
-    GRAVITY,
-    Grid,
-    hull_of,
-    level_mesh,
-    Mesh,
-    nearest_rest,
-    Path,
-    pieces_of,
-    Probes,
-    Rigid,
-    rotation_of,
-    Solid,
-    stable_directions,
-    together,
-)
+from dano.comparison import _bodies
 from dano.comparison._mujoco import MuJoCo
 from dano.comparison._own import Own
 from dano.comparison._pybullet import has_pybullet, PyBullet
@@ -117,13 +100,13 @@ class _Bench(NamedTuple):
     """What all rows share."""
 
     thing: NeuralObject
-    solid: Solid
+    solid: _bodies.Solid
     stable: Float[np.ndarray, "n 3"]
-    starts: list[Drop]
+    starts: list[_bodies.Drop]
     n_steps: int
-    probes: Probes
+    probes: _bodies.Probes
     truth: NeuralObject | None
-    true_paths: dict[str, list[Path]]
+    true_paths: dict[str, list[_bodies.Path]]
 
 
 def compare(
@@ -178,7 +161,7 @@ def compare(
     say = checked_progress(progress)
     say("reference", 0.0)
     bench = _bench(thing, truth, drops, seed)
-    best = best_level(grid, bench.solid.moments.volume)
+    best = _bodies.best_level(grid, bench.solid.moments.volume)
     missing = _missing(decomposed)
     say("the object itself", 0.02)
     rows, scenery = [], []
@@ -193,7 +176,7 @@ def compare(
 
 def _measure_meshes(
     bench: _Bench,
-    grid: Grid,
+    grid: _bodies.Grid,
     levels: Sequence[float],
     best: float,
     decomposed: bool,
@@ -205,19 +188,21 @@ def _measure_meshes(
     jobs = [(level, cleaned) for level in levels for cleaned in (False, True)]
     for i, (level, cleaned) in enumerate(jobs):
         say(f"surface at {level:.3g}", 0.1 + 0.4 * i / len(jobs))
-        mesh = level_mesh(grid, level, cleaned=cleaned)
+        mesh = _bodies.level_mesh(grid, level, cleaned=cleaned)
         route = "hull of the cleaned surface" if cleaned else "hull of the surface as it is"
-        _mesh_row(bench, mesh, route, hull_of, MuJoCo, rows, scenery)
+        _mesh_row(bench, mesh, route, _bodies.hull_of, MuJoCo, rows, scenery)
     say("best surface", 0.5)
-    mesh = level_mesh(grid, best, cleaned=True)
-    _mesh_row(bench, mesh, "best surface: hull", hull_of, MuJoCo, rows, scenery)
+    mesh = _bodies.level_mesh(grid, best, cleaned=True)
+    _mesh_row(bench, mesh, "best surface: hull", _bodies.hull_of, MuJoCo, rows, scenery)
     say("its signed distance", 0.55)
-    _mesh_row(bench, mesh, "best surface: signed distance", hull_of, MuJoCo, rows, scenery, as_distance=True)
+    _mesh_row(
+        bench, mesh, "best surface: signed distance", _bodies.hull_of, MuJoCo, rows, scenery, as_distance=True
+    )
     if has_pybullet():
-        _mesh_row(bench, mesh, "best surface: hull", hull_of, PyBullet, rows, scenery)
+        _mesh_row(bench, mesh, "best surface: hull", _bodies.hull_of, PyBullet, rows, scenery)
     if decomposed and is_installed("coacd"):
         say("convex pieces", 0.65)
-        pieces = pieces_of(grid, mesh)
+        pieces = _bodies.pieces_of(grid, mesh)
         engines = (MuJoCo, PyBullet) if has_pybullet() else (MuJoCo,)
         for engine in engines:
             _mesh_row(bench, mesh, "best surface: CoACD", lambda _: pieces, engine, rows, scenery)
@@ -236,10 +221,10 @@ def _missing(decomposed: bool) -> list[str]:
     return found
 
 
-def _grid(field: AbstractField) -> Grid:
+def _grid(field: AbstractField) -> _bodies.Grid:
     if not isinstance(field, GridField):
         field, _ = bake(field, _RESOLUTION)
-    return Grid(
+    return _bodies.Grid(
         np.maximum(np.asarray(node_values(field), np.float64), 0),
         np.asarray(field.origin, np.float64),
         np.asarray(field.spacing, np.float64),
@@ -275,7 +260,7 @@ def _bench(thing: NeuralObject, truth: AbstractShape | None, drops: int, seed: i
     mesh, normals = solid_triangles(shape, _RESOLUTION)
     hull = convex_hull(mesh.vertices)
     size = float(np.ptp(mesh.vertices, axis=0).max())
-    solid = Solid(enclosed(mesh), mesh.vertices, normals, hull, size)
+    solid = _bodies.Solid(enclosed(mesh), mesh.vertices, normals, hull, size)
     com = np.asarray((thing if true is None else true).mass.com, np.float64)
     random = np.random.default_rng(seed)
     starts = [_start(hull.vertices, size, random) for _ in range(drops)]
@@ -285,22 +270,24 @@ def _bench(thing: NeuralObject, truth: AbstractShape | None, drops: int, seed: i
     centres = mesh.vertices[chosen] + (radius + clear)[:, None] * normals[chosen]
     # Not `clear`: another part of the surface may be nearer.
     clearance = signed_distances(shape, centres)[0] - radius
-    probes = Probes(centres, radius, clearance)
-    n_steps = round(_SETTLED * math.sqrt(size / GRAVITY) / TIMESTEP)
-    stable = stable_directions(hull, com)
+    probes = _bodies.Probes(centres, radius, clearance)
+    n_steps = round(_SETTLED * math.sqrt(size / _bodies.GRAVITY) / TIMESTEP)
+    stable = _bodies.stable_directions(hull, com)
     if true is None:
         # The object touches by samples. Where its surface is ragged their hull stands on other points.
         samples = convex_hull(np.asarray(thing.surface.points, np.float64))
-        stable = np.concatenate([stable, stable_directions(samples, com)])
+        stable = np.concatenate([stable, _bodies.stable_directions(samples, com)])
     return _Bench(thing, solid, stable, starts, n_steps, probes, true, {})
 
 
-def _start(points: Float[np.ndarray, "n 3"], size: float, random: np.random.Generator) -> Drop:
+def _start(points: Float[np.ndarray, "n 3"], size: float, random: np.random.Generator) -> _bodies.Drop:
     """A random orientation, slowly turning, the lowest point a quarter of the size over the floor."""
     orientation = random.normal(size=4)
     orientation /= np.linalg.norm(orientation)
-    start = Drop(np.zeros(3), orientation, 0.3 * math.sqrt(GRAVITY / size) * random.normal(size=3))
-    lowest = float((points @ rotation_of(start)[2]).min())
+    start = _bodies.Drop(
+        np.zeros(3), orientation, 0.3 * math.sqrt(_bodies.GRAVITY / size) * random.normal(size=3)
+    )
+    lowest = float((points @ _bodies.rotation_of(start)[2]).min())
     return start._replace(origin=np.array([0.0, 0.0, _ABOVE * size - lowest]))
 
 
@@ -328,9 +315,9 @@ def _own_row(bench: _Bench) -> Row:
 
 def _mesh_row(
     bench: _Bench,
-    mesh: Mesh,
+    mesh: _bodies.Mesh,
     route: str,
-    touch: Callable[[Mesh], tuple[list[Triangles], float]],
+    touch: Callable[[_bodies.Mesh], tuple[list[Triangles], float]],
     engine: type[MuJoCo] | type[PyBullet],
     rows: list[Row],
     scenery: list[Scenery],
@@ -352,14 +339,14 @@ def _mesh_row(
         pieces, seconds = touch(mesh)
         moments, note = mesh.moments, ""
         if "CoACD" in route:
-            moments = together(pieces)
+            moments = _bodies.together(pieces)
         inertia = _inertia(bench, moments)
         if inertia is None:
             moments, note = enclosed(pieces[0]), "weighed by its hull: the mesh encloses no volume"
             inertia = _inertia(bench, moments)
         if inertia is None:
             raise ValueError("its hull encloses no volume")
-        rigid = Rigid(pieces, float(bench.thing.mass.mass), moments.com, inertia)
+        rigid = _bodies.Rigid(pieces, float(bench.thing.mass.mass), moments.com, inertia)
         rigid = rigid._replace(surface=triangles if as_distance else None)
         begin = time.perf_counter() - mesh.seconds - seconds
         made = engine(rigid, TIMESTEP)
@@ -406,20 +393,20 @@ def _measured(
         row = row._replace(note=f"{unsolved} of {bench.n_steps * len(paths)} steps were not solved")
     row = row._replace(
         preparation=prepared,
-        tilt=max(nearest_rest(turn[2], bench.stable) for turn, _ in last),
+        tilt=max(_bodies.nearest_rest(turn[2], bench.stable) for turn, _ in last),
         gap=max(gaps, key=abs),
         phantom=phantom,
         phantom_gap=largest / size,
         missed=missed,
         step_time=min(path.step_time for path in paths),
         motion_error=_motion_error(bench, engine.name, paths),
-        moving=float(max(speeds)) / math.sqrt(size * GRAVITY),
+        moving=float(max(speeds)) / math.sqrt(size * _bodies.GRAVITY),
     )
     rows.append(row)
     scenery.append(Scenery(row, pieces or [surface], surface, *last[0]))
 
 
-def _motion_error(bench: _Bench, engine: str, paths: list[Path]) -> float:
+def _motion_error(bench: _Bench, engine: str, paths: list[_bodies.Path]) -> float:
     """Against the true solid in the same engine: on a plane its hull is as good as itself."""
     if bench.truth is None:
         return math.nan
@@ -428,14 +415,14 @@ def _motion_error(bench: _Bench, engine: str, paths: list[Path]) -> float:
         if engine == Own.name:
             true: _Engine = Own(bench.truth, TIMESTEP)
         else:
-            rigid = Rigid(
+            rigid = _bodies.Rigid(
                 [bench.solid.hull], float(mass.mass), np.asarray(mass.com), np.asarray(mass.inertia)
             )
             true = (MuJoCo if engine == MuJoCo.name else PyBullet)(rigid, TIMESTEP)
         bench.true_paths[engine] = [true.drop(start, bench.n_steps) for start in bench.starts]
         true.close()
     # Three times the time to the floor: later, what is chaotic is larger than what is wrong.
-    until = round(3 * math.sqrt(2 * _ABOVE * bench.solid.size / GRAVITY) / TIMESTEP)
+    until = round(3 * math.sqrt(2 * _ABOVE * bench.solid.size / _bodies.GRAVITY) / TIMESTEP)
     points = bench.solid.hull.vertices
     apart = [
         np.linalg.norm(path.of(points, until) - true.of(points, until), axis=-1).max()

@@ -3,6 +3,7 @@
 from dano.contact._centroid import CentroidLaw as CentroidLaw
 from dano.contact._colliders import (
     Collider as Collider,
+    Patch as Patch,
     SampleSet as SampleSet,
     Support as Support,
     SurfaceSet as SurfaceSet,
@@ -25,4 +26,3 @@ from dano.contact._laws import (
     Setting as Setting,
     STANDARD_GRAVITY as STANDARD_GRAVITY,
 )
-from dano.contact._overlap import overlap as overlap, Patch as Patch

@@ -1,24 +1,20 @@
-"""What a contact sees of a body: samples to be tested, a field to be queried, and where both are."""
+"""What a contact sees of a body: samples to be tested and a field to be queried; what it finds of a pair."""
+
+from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, DTypeLike, Float
+from jaxtyping import Array, Bool, DTypeLike, Float
 
-from dano.checks import checked_optional
 from dano.fields import AbstractField, GridField
-from dano.maths import AnyArray, checked_array, floating, Numbers, Pose, safe_norm
+from dano.maths import AnyArray, floating, Numbers
 
 # Samples per block. Fewer make the culling finer, more make each pass over a block fatter.
 BLOCK = 16
 
-# Order of `SampleSet.products`, and where each entry of the symmetric 4×4 matrix stands in it.
-PRODUCTS = tuple((j, k) for j in range(4) for k in range(j, 4))
-SYMMETRIC = np.array([[PRODUCTS.index((min(j, k), max(j, k))) for k in range(4)] for j in range(4)])
-
 
 class SampleSet(eqx.Module):
-    """Weighted contact samples in the field frame, in the layout the overlap kernels want.
+    """Weighted contact samples in the field frame, in the layout that kernels want.
 
     Samples are ordered so that each run of `BLOCK` is compact in space; the last run is filled up with copies
     of weight zero.
@@ -26,8 +22,6 @@ class SampleSet(eqx.Module):
 
     # Homogeneous coordinates (x, y, z, 1) [m, F], shape (4, n); rows are contiguous.
     points: Float[Array, "4 n"]
-    # x̃_j x̃_k of the homogeneous coordinates for j ≤ k, shape (10, n): what derivatives sum over.
-    products: Float[Array, "10 n"]
     weights: Float[Array, " n"]  # φ_i / Σφ, shape (n,); they sum to one
     centers: Float[Array, "blocks 3"]  # Centre of each block [m, F], shape (n / BLOCK, 3)
     radii: Float[Array, " blocks"]  # Radius of each block about its centre [m], shape (n / BLOCK,)
@@ -41,9 +35,7 @@ class SampleSet(eqx.Module):
             density: Density φ ≥ 0 of each sample [arbitrary unit]; not all zero.
         """
         x, phi = np.asarray(points, dtype=np.float64), np.asarray(density, dtype=np.float64)
-        homogeneous, weights, centers, radii = _in_blocks(x, phi / phi.sum())
-        products = np.stack([homogeneous[j] * homogeneous[k] for j, k in PRODUCTS])
-        return cls(*(floating(x) for x in (homogeneous, products, weights, centers, radii)))
+        return cls(*(floating(part) for part in _in_blocks(x, phi / phi.sum())))
 
 
 class SurfaceSet(eqx.Module):
@@ -101,70 +93,36 @@ class Support(eqx.Module):
         origin = np.asarray(field.origin, dtype=np.float64) - border * spacing
         return cls(floating(np.maximum(distance - slack, 0.0)), floating(origin), floating(spacing))
 
-    def lower_bound(self, x: Float[Array, "3 n"]) -> Float[Array, " n"]:
-        """Lower bound on the distance [m] from points [m, F] to the support; zero inside it."""
-        last = jnp.asarray(self.distance.shape, x.dtype)[:, None] - 1
-        position = (x - self.origin[:, None]) / self.spacing[:, None]
-        inside = jnp.clip(position, 0, last)
-        node = jnp.round(inside)
-        i, j, k = node.astype(jnp.int32)
-        # A distance falls by no more than the way gone. From outside the map, the way to its edge counts too.
-        way = safe_norm((position - node) * self.spacing[:, None], axis=0)
-        outside = safe_norm((position - inside) * self.spacing[:, None], axis=0)
-        return jnp.maximum(self.distance[i, j, k] - way, outside)
-
 
 # How many cells a node's B-spline reaches to each side.
 _REACH = {"linear": 1.0, "quadratic": 1.5, "cubic": 2.0}
 
 
-class Collider(eqx.Module):
-    """One side of a contact at its current pose.
+class Collider(NamedTuple):
+    """One side of a contact of shared mass, in the frame of its field."""
 
-    Attributes:
-        samples: Contact samples tested against the other side's field, or None for a primitive.
-        field: Density field queried by the other side's samples, or None if the object has none.
-        support: Culling map of the field, or None to query it everywhere.
-        density_scale: Multiplies the field's density to make it dimensionless (1 for a shape's occupancy).
-        mass: Mass [kg] that the sample weights sum to.
-        rotation: Field frame → world, shape (3, 3).
-        origin: Origin of the field frame [m, W], shape (3,).
-    """
+    field: AbstractField | None  # Density that the other side's samples ask for; None if there is none
+    samples: SampleSet | None  # Tested against the other side's field; None of a primitive
+    support: Support | None  # What skips samples far from the field; None: made where a grid needs it
+    density_scale: Float[Array, ""]  # Makes the field's density dimensionless (1 for a shape's occupancy)
 
-    samples: SampleSet | None
-    field: AbstractField | None
-    support: Support | None
-    density_scale: Float[Array, ""]
-    mass: Float[Array, ""]
-    rotation: Float[Array, "3 3"]
-    origin: Float[Array, "3"]
 
-    def __init__(
-        self,
-        field: AbstractField | None = None,
-        samples: SampleSet | None = None,
-        *,
-        support: Support | None = None,
-        density_scale: Numbers = 1.0,
-        mass: Numbers = 1.0,
-        pose: Pose | None = None,
-        rotation: Array | None = None,
-        origin: Array | None = None,
-    ):
-        """Build a collider; give either `pose` or both `rotation` and `origin` (default: identity).
+class Patch(eqx.Module):
+    """Overlap of two bodies."""
 
-        Raises:
-            ValueError: If an argument is of another kind, or a number is negative or not finite.
-        """
-        checked_optional("field", field, AbstractField)
-        checked_optional("samples", samples, SampleSet)
-        checked_optional("support", support, Support)
-        pose = checked_optional("pose", pose, Pose) or Pose()
-        self.samples, self.field, self.support = samples, field, support
-        self.density_scale = checked_array("density_scale", density_scale, (), least=0.0)
-        self.mass = checked_array("mass", mass, (), least=0.0)
-        self.rotation = pose.matrix if rotation is None else rotation
-        self.origin = pose.position if origin is None else origin
+    overlap: Float[Array, ""]  # ψ, the sampled mass inside the other body [kg], shape ()
+    centroid: Float[Array, "3"]  # χ, its centroid [m, W], shape (3,)
+    normal: Float[Array, "3"]  # n, unit vector from the second body (B) to the first (A) [W], shape (3,)
+
+    @property
+    def point(self) -> Float[Array, "3"]:
+        """What twists and wrenches refer to [m, W]: the centroid."""
+        return self.centroid
+
+    @property
+    def touching(self) -> Bool[Array, ""]:
+        """Whether the bodies overlap, so that there is a centroid."""
+        return self.overlap > 0
 
 
 def _in_blocks(points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -27,6 +27,7 @@ from dano.engine.batches import (
     gather as gather,
     load_rollouts as load_rollouts,
     map_rows as map_rows,
+    RolloutOptions as RolloutOptions,
     Rollouts as Rollouts,
     rollouts as rollouts,
     StoredRollouts as StoredRollouts,

@@ -4,6 +4,7 @@ from dano.exchange._export import (
     check_folder as check_folder,
     export_object as export_object,
     Exported as Exported,
+    ExportOptions as ExportOptions,
     Format as Format,
 )
 from dano.exchange._robots import export_robot as export_robot

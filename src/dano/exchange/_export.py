@@ -1,5 +1,6 @@
 """The verb: an object as a folder that other simulators load."""
 
+import dataclasses
 import json
 import os
 import re
@@ -16,6 +17,7 @@ from dano.contact import ContactParams
 from dano.exchange import _mjcf, _urdf, _usd
 from dano.exchange._triangles import (
     chosen_collision,
+    Collision,
     Contents,
     convex_hull,
     decomposition,
@@ -61,6 +63,37 @@ _BYTES_PER_NODE = 400
 """What finding the surface takes at its peak, over the nodes of its lattice."""
 
 
+@dataclasses.dataclass(frozen=True)
+class ExportOptions:
+    """How finely an object is written, and what touches.
+
+    Attributes:
+        collision: coacd: convex decomposition; hull: convex hull; auto: the first if coacd is installed.
+        concavity: Of CoACD: how deep a piece may be concave, as a share of the size; in [0.01, 1].
+        max_pieces: Most pieces of CoACD; default: as many as `concavity` takes.
+        resolution: Nodes along the longest axis for the visible surface, from 8 to 512.
+        texture_size: Texels along the picture with the colours, from 64 to 8192.
+    """
+
+    collision: Collision = "auto"
+    concavity: float = 0.05
+    max_pieces: int | None = None
+    resolution: int = 64
+    texture_size: int = 1024
+
+    def __post_init__(self) -> None:
+        """Check all numbers.
+
+        Raises:
+            ValueError: If one is out of range.
+        """
+        checks.checked_number("concavity", self.concavity, least=0.01, most=1)
+        if self.max_pieces is not None:
+            checks.checked_count("max_pieces", self.max_pieces)
+        checks.checked_count("resolution", self.resolution, least=8, most=512)
+        checks.checked_count("texture_size", self.texture_size, least=64, most=8192)
+
+
 class Exported(NamedTuple):
     """What was written."""
 
@@ -82,12 +115,8 @@ def export_object(
     look: "LearnedField | Splats | None" = None,
     surroundings: Splats | None = None,
     contact: ContactParams | None = None,
-    collision: str = "auto",
-    concavity: float = 0.05,
-    max_pieces: int | None = None,
-    resolution: int = 64,
-    texture_size: int = 1024,
     progress: Progress | None = None,
+    **options: Any,
 ) -> Exported:
     """Write an object as a folder of files that other simulators load.
 
@@ -106,13 +135,8 @@ def export_object(
         surroundings: Gaussians of what does not move with the object, in the same frame.
         contact: Parameters of its contacts; default `ContactParams()`. Friction goes into every format but
             OBJ, restitution into USD, stiffness into USD for Newton, the rest nowhere.
-        collision: "coacd": convex decomposition; "hull": convex hull; "auto": the first if CoACD is
-            installed.
-        concavity: Of CoACD: how deep a piece may be concave, as a share of the size; in [0.01, 1].
-        max_pieces: Most pieces of CoACD; default: as many as `concavity` takes.
-        resolution: Nodes along the longest axis for the visible surface, from 8 to 512.
-        texture_size: Texels along the picture with the colours, from 64 to 8192.
         progress: Called with a description and the share done.
+        **options: Of `ExportOptions`.
 
     Returns:
         What was written.
@@ -129,21 +153,24 @@ def export_object(
     contact = checks.checked_optional("contact", contact, ContactParams) or ContactParams()
     splats, learned = _checked_look(look, surroundings)
     say = checks.checked_progress(progress)
-    how = chosen_collision(collision, solid=obj.solid is not None)
-    _check_numbers(concavity, max_pieces, resolution, texture_size)
+    chosen = ExportOptions(**options)
+    how = chosen_collision(chosen.collision, solid=obj.solid is not None)
     check_folder(target)
     say("surface", 0.0)
-    mesh, normals, coarse = _surfaces(obj, resolution)
+    mesh, normals, coarse = _surfaces(obj, chosen.resolution)
     say("convex pieces", 0.1)
-    pieces = [convex_hull(mesh.vertices)] if how == "hull" else decomposition(coarse, concavity, max_pieces)
+    if how == "hull":
+        pieces = [convex_hull(mesh.vertices)]
+    else:
+        pieces = decomposition(coarse, chosen.concavity, chosen.max_pieces)
     say("colours", 0.6)
     com, inertia = (np.asarray(each, np.float64) for each in (obj.mass.com, obj.mass.inertia))
     contents = Contents(
         *(name, float(obj.mass.mass), com, inertia),
         mesh=mesh,
-        resolution=resolution,
+        resolution=chosen.resolution,
         normals=normals,
-        texture=None if learned is None else painted(learned, mesh, normals, texture_size),
+        texture=None if learned is None else painted(learned, mesh, normals, chosen.texture_size),
         pieces=pieces,
         contact=contact,
         splats=splats,
@@ -202,14 +229,6 @@ def _checked_name(name: str) -> str:
     if name in ("scene", SURROUNDINGS, MESHES):
         raise ValueError(f"name must not be {name!r}, which other files of the folder are called")
     return name
-
-
-def _check_numbers(concavity: float, max_pieces: int | None, resolution: int, texture_size: int) -> None:
-    checks.checked_number("concavity", concavity, least=0.01, most=1)
-    if max_pieces is not None:
-        checks.checked_count("max_pieces", max_pieces)
-    checks.checked_count("resolution", resolution, least=8, most=512)
-    checks.checked_count("texture_size", texture_size, least=64, most=8192)
 
 
 def check_folder(folder: Path) -> None:

@@ -26,7 +26,6 @@ from dano.fields._convex import (
     load_coacd as load_coacd,
 )
 from dano.fields._grid import degree_of as degree_of, DensityMoments as DensityMoments, GridField as GridField
-from dano.fields._hash_grid import HashGrid as HashGrid
 from dano.fields._host import (
     density_at as density_at,
     distance_at as distance_at,
@@ -61,7 +60,7 @@ from dano.fields.readers import (
     FIELD_SUFFIXES as FIELD_SUFFIXES,
     is_splats as is_splats,
     load_field as load_field,
-    offer_models as offer_models,
+    offer_learned as offer_learned,
     read_splats as read_splats,
     save_field as save_field,
     Splats as Splats,

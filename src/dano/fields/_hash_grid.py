@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, Float, Int, UInt32
 
 _PRIMES = (1, 2654435761, 805459861)
 """Of the spatial hash (Müller et al., Instant Neural Graphics Primitives, 2022, eq. 4)."""
@@ -25,44 +24,6 @@ class HashGrid(eqx.Module):
     # Nodes along an axis of a dense level, 0 for a hashed one (static).
     resolutions: tuple[int, ...] = eqx.field(static=True)
     shift: float = eqx.field(static=True)  # Where x = 0 lies, in cells: 0 or ½ (static)
-
-    @classmethod
-    def create(
-        cls,
-        *,
-        n_levels: int = 12,
-        n_features: int = 2,
-        coarsest: int = 8,
-        finest: int = 128,
-        log2_table: int = 15,
-        key: PRNGKeyArray,
-    ) -> "HashGrid":
-        """Random features in ±10⁻⁴, as the paper starts; levels that fit into a table are dense.
-
-        Args:
-            n_levels: Grids, their cells along an axis in geometric progression.
-            n_features: Features of each.
-            coarsest: Cells along an axis of the first.
-            finest: Of the last.
-            log2_table: Each level has at most 2^log2_table rows.
-            key: Random key.
-
-        Raises:
-            ValueError: If a number is out of range.
-        """
-        if not (n_levels >= 1 and n_features >= 1 and 1 <= coarsest <= finest and 1 <= log2_table <= 24):
-            raise ValueError(
-                "n_levels and n_features must be ≥ 1, 1 ≤ coarsest ≤ finest and 1 ≤ log2_table ≤ 24, got"
-                f" {n_levels}, {n_features}, {coarsest}, {finest}, {log2_table}"
-            )
-        cells = np.round(np.geomspace(coarsest, finest, n_levels)).astype(int).tolist()
-        tables, resolutions = [], []
-        for cell, own in zip(cells, jax.random.split(key, n_levels), strict=True):
-            dense = (cell + 1) ** 3 <= 2**log2_table
-            entries = (cell + 1) ** 3 if dense else 2**log2_table
-            tables.append(jax.random.uniform(own, (entries, n_features), jnp.float32, -1e-4, 1e-4))
-            resolutions.append(cell + 1 if dense else 0)
-        return cls(tuple(tables), tuple(map(float, cells)), tuple(resolutions), 0.0)
 
     def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, "n width"]:
         """Features at points in the unit cube."""

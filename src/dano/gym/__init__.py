@@ -2,6 +2,7 @@
 
 from dano.extras import is_installed as _is_installed
 from dano.gym._making import (
+    EnvOptions as EnvOptions,
     make_env as make_env,
     make_env_of_files as make_env_of_files,
     make_vector_env as make_vector_env,

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -19,19 +20,42 @@ from dano.vision import Camera
 _NEED = "environments need gymnasium"
 
 
-def make_env(
-    scene: Scene,
-    state: State,
-    task: Task,
-    *,
-    start: Start | None = None,
-    repeat: int = 1,
-    shaping: float = 1.0,
-    engine: AbstractEngine | None = None,
-    render_mode: str | None = None,
-    size: tuple[int, int] = (640, 400),
-    camera: Camera | None = None,
-) -> Any:
+@dataclass(frozen=True)
+class EnvOptions:
+    """How a scene and a task become an environment.
+
+    Attributes:
+        start: Makes the state where an episode begins instead, from the environment's random numbers.
+        repeat: Steps of the scene in a step of the environment.
+        shaping: Reward for each unit by which the goals' errors fall.
+        engine: Default `VariationalEngine()`.
+        render_mode: "rgb_array", of a single one also "human" (extra `view`), or None.
+        size: Width and height of pictures [pixels], even numbers.
+        camera: From where they are taken, in place of `size`; default: sees all.
+    """
+
+    start: Start | None = None
+    repeat: int = 1
+    shaping: float = 1.0
+    engine: AbstractEngine | None = None
+    render_mode: str | None = None
+    size: tuple[int, int] = (640, 400)
+    camera: Camera | None = None
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a scene.
+
+        Raises:
+            ValueError: If an option is of another kind, or out of range.
+        """
+        checks.checked_optional("engine", self.engine, AbstractEngine)
+        if self.start is not None:
+            checks.checked_function("start", self.start)
+        checks.checked_count("repeat", self.repeat)
+        checks.checked_number("shaping", self.shaping, least=0)
+
+
+def make_env(scene: Scene, state: State, task: Task, **options: Any) -> Any:
     """A `gymnasium.Env` of a scene and a task.
 
     Actions are the task's actuators between −1 and 1, where the ends are their bounds. An episode ends
@@ -47,13 +71,7 @@ def make_env(
         scene: The scene.
         state: Where episodes begin.
         task: What shall be done.
-        start: Makes the state where an episode begins instead, from the environment's random numbers.
-        repeat: Steps of the scene in a step of the environment.
-        shaping: Reward for each unit by which the goals' errors fall.
-        engine: Default `VariationalEngine()`.
-        render_mode: "rgb_array", "human" (extra `view`), or None.
-        size: Width and height of pictures [pixels], even numbers.
-        camera: From where they are taken, in place of `size`; default: a camera that sees all.
+        **options: Of `EnvOptions`.
 
     Raises:
         ImportError: Without the extra `gym`, or for "human" without `view`.
@@ -62,24 +80,12 @@ def make_env(
     optional("gymnasium", _NEED, "gym")
     from dano.gym._environments import SceneEnv
 
-    rules = _checked(scene, state, task, start, repeat, shaping, engine)
-    return SceneEnv(rules, state, start, _rendering(rules, state, render_mode, MODES, size, camera))
+    chosen = EnvOptions(**options)
+    rules = _rules(scene, state, task, chosen)
+    return SceneEnv(rules, state, chosen.start, _rendering(rules, state, chosen, MODES))
 
 
-def make_vector_env(
-    scene: Scene,
-    state: State,
-    task: Task,
-    n_envs: int,
-    *,
-    start: Start | None = None,
-    repeat: int = 1,
-    shaping: float = 1.0,
-    engine: AbstractEngine | None = None,
-    render_mode: str | None = None,
-    size: tuple[int, int] = (640, 400),
-    camera: Camera | None = None,
-) -> Any:
+def make_vector_env(scene: Scene, state: State, task: Task, n_envs: int, **options: Any) -> Any:
     """A `gymnasium.vector.VectorEnv` of many episodes, whose steps are one launch of the engine.
 
     Episodes that end begin again in the next step, as `AutoresetMode.NEXT_STEP` says.
@@ -87,17 +93,11 @@ def make_vector_env(
     state have a first axis of `n_envs`.
 
     Args:
-        scene: As in `make_env`, as are the others.
+        scene: The scene.
         state: Where episodes begin.
         task: What shall be done.
         n_envs: How many.
-        start: Makes the state where an episode begins.
-        repeat: Steps of the scene in a step of the environment.
-        shaping: Reward for each unit by which the goals' errors fall.
-        engine: Default `VariationalEngine()`.
-        render_mode: "rgb_array", with which `render()` gives a picture of each episode, or None.
-        size: Width and height of pictures [pixels], even numbers.
-        camera: From where they are taken, in place of `size`.
+        **options: Of `EnvOptions`. With `render_mode="rgb_array"`, `render()` draws each episode.
 
     Raises:
         ImportError: Without the extra `gym`.
@@ -106,11 +106,11 @@ def make_vector_env(
     optional("gymnasium", _NEED, "gym")
     from dano.gym._environments import SceneVectorEnv
 
-    n_envs = checks.checked_count("n_envs", n_envs)
-    rules = _checked(scene, state, task, start, repeat, shaping, engine)
+    n_envs, chosen = checks.checked_count("n_envs", n_envs), EnvOptions(**options)
+    rules = _rules(scene, state, task, chosen)
     # A page shows one episode.
-    rendering = _rendering(rules, state, render_mode, MODES[:1], size, camera, n_envs)
-    return SceneVectorEnv(rules, state, n_envs, start, rendering)
+    rendering = _rendering(rules, state, chosen, MODES[:1], n_envs)
+    return SceneVectorEnv(rules, state, n_envs, chosen.start, rendering)
 
 
 def stable_baselines_env(env: Any) -> Any:
@@ -141,7 +141,7 @@ def make_env_of_files(scene: str | os.PathLike[str], task: str | os.PathLike[str
     Args:
         scene: Scene file (.toml).
         task: Task file (.toml), as `dano plan` takes.
-        **options: Of `make_env`, such as `render_mode`, `repeat` and `shaping`.
+        **options: Of `EnvOptions`.
 
     Raises:
         ImportError: As `make_env`.
@@ -160,7 +160,7 @@ def make_vector_env_of_files(
         scene: Scene file (.toml).
         task: Task file (.toml), as `dano plan` takes.
         num_envs: How many episodes.
-        **options: Of `make_vector_env`.
+        **options: Of `EnvOptions`.
 
     Raises:
         ImportError: As `make_vector_env`.
@@ -171,38 +171,19 @@ def make_vector_env_of_files(
     return make_vector_env(loaded.scene, loaded.state, asked, num_envs, **options)
 
 
-def _checked(
-    scene: Scene,
-    state: State,
-    task: Task,
-    start: Start | None,
-    repeat: int,
-    shaping: float,
-    engine: AbstractEngine | None,
-) -> Rules:
+def _rules(scene: Scene, state: State, task: Task, options: EnvOptions) -> Rules:
     checks.checked_kind("scene", scene, Scene).check_state(state)
     checks.checked_kind("task", task, Task)
-    checks.checked_optional("engine", engine, AbstractEngine)
-    if start is not None:
-        checks.checked_function("start", start)
     if jax.tree.leaves(state)[0].ndim != 2:
         raise ValueError(f"state must be one state, got leaves of shape {jax.tree.leaves(state)[0].shape}")
     task.check(scene)
-    repeat = checks.checked_count("repeat", repeat)
-    shaping = checks.checked_number("shaping", shaping, least=0)
-    return Rules(scene, task, engine or VariationalEngine(), repeat, shaping)
+    return Rules(scene, task, options.engine or VariationalEngine(), options.repeat, options.shaping)
 
 
 def _rendering(
-    rules: Rules,
-    state: State,
-    mode: str | None,
-    modes: Sequence[str],
-    size: tuple[int, int],
-    camera: Camera | None,
-    n_envs: int = 1,
+    rules: Rules, state: State, options: EnvOptions, modes: Sequence[str], n_envs: int = 1
 ) -> Rendering:
-    if mode is not None:
-        checks.checked_choice("render_mode", mode, modes)
+    if options.render_mode is not None:
+        checks.checked_choice("render_mode", options.render_mode, modes)
     period = rules.repeat * float(rules.scene.timestep)
-    return Rendering(rules.scene, state, mode, period, size, camera, n_envs)
+    return Rendering(rules.scene, state, options.render_mode, period, options.size, options.camera, n_envs)

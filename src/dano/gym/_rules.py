@@ -41,20 +41,14 @@ class Rules(eqx.Module):
     The reward of a step is minus its cost in the task, h (½ Σ price u² + ½ Σ running |e|²), minus
     ½ Σ final |e|² at the end of the time, plus `shaping` times what Σ |e| of the goals fell by. Such a
     difference of a potential leaves the best policy what it is (Ng, Harada and Russell 1999).
-
-    Attributes:
-        scene: The scene.
-        task: Actuators, goals and time.
-        engine: Of the steps.
-        repeat: Steps of the scene in a step of the environment, with the same action (static).
-        shaping: See above [1/unit of the goals].
     """
 
-    scene: Scene
-    task: Task
-    engine: AbstractEngine
+    scene: Scene  # The scene
+    task: Task  # Actuators, goals and time
+    engine: AbstractEngine  # Of the steps
+    # Steps of the scene in a step of the environment, with the same action (static).
     repeat: int = eqx.field(static=True)
-    shaping: float = eqx.field(static=True)
+    shaping: float = eqx.field(static=True)  # See above [1/unit of the goals]
 
     @property
     def n_steps(self) -> int:

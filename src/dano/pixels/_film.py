@@ -6,8 +6,9 @@ state, controls, and light. Where a silhouette moves, derivatives are those of a
 pixel wide.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,39 @@ _MOMENTS = 5
 """Pictures that a blurred frame is the mean of: enough for some pixels of blur."""
 
 
+@dataclasses.dataclass(frozen=True)
+class FilmOptions:
+    """Which frames and pixels of a rollout are rendered, and how.
+
+    Attributes:
+        every: Steps between frames; the first frame shows the initial state.
+        pixels: Image coordinates (x to the right, y downwards) of the pixels wanted; default: all, row by
+            row. Fewer cost less, e.g. those near silhouettes.
+        background: sRGB behind the bodies, of one colour (3,) or of every pixel (n, 3).
+        shutter: How long a frame is exposed, half before and half after its time [s]; what moves is blurred.
+        sampling: How finely rays are sampled.
+    """
+
+    every: int = 1
+    pixels: Float[np.ndarray, "n 2"] | None = None
+    background: Numbers = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    shutter: float = 0.0
+    sampling: Sampling = FILM_SAMPLING
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a camera.
+
+        Raises:
+            ValueError: If `every` is < 1, or `shutter` is negative.
+        """
+        checked_count("every", self.every)
+        checked_number("shutter", self.shutter, least=0)
+
+
 class RolloutPictures(NamedTuple):
     """Pictures of a rollout."""
 
@@ -53,12 +87,8 @@ def film(
     lights: Sequence[Light],
     *,
     controls: Control | Policy | None = None,
-    every: int = 1,
-    pixels: Float[np.ndarray, "n 2"] | None = None,
-    background: Numbers = (0.0, 0.0, 0.0),
-    shutter: float = 0.0,
-    sampling: Sampling = FILM_SAMPLING,
     engine: AbstractEngine | None = None,
+    **options: Any,
 ) -> RolloutPictures:
     """Simulate a scene and render some of its bodies, differentiably.
 
@@ -74,13 +104,8 @@ def film(
         camera: From where.
         lights: Lamps, fixed in the world while bodies turn.
         controls: As in `simulate`.
-        every: Steps between frames; the first frame shows the initial state.
-        pixels: Image coordinates (x to the right, y downwards) of the pixels wanted; default: all, row by
-            row. Fewer cost less, e.g. those near silhouettes.
-        background: sRGB behind the bodies, of one colour (3,) or of every pixel (n, 3).
-        shutter: How long a frame is exposed, half before and half after its time [s]; what moves is blurred.
-        sampling: How finely rays are sampled.
         engine: As in `simulate`.
+        **options: Of `FilmOptions`.
 
     Raises:
         ValueError: If a look is of no body, there is none, there is no light, `every` is < 1, `shutter` is
@@ -91,13 +116,12 @@ def film(
     n_steps = checked_count("n_steps", n_steps)
     checked_kind("camera", camera, AbstractCamera)
     checked_kind("looks", looks, Mapping)
-    every = checked_count("every", every)
-    shutter = checked_number("shutter", shutter, least=0)
+    chosen = FilmOptions(**options)
     _check(scene, looks, lights)
     trajectory = simulate(scene, state, n_steps, controls=controls, engine=engine)
-    at = np.arange(0, n_steps + 1, every)
-    during = (np.arange(_MOMENTS) + 0.5) / _MOMENTS - 0.5 if shutter else np.zeros(1)
-    steps = jnp.asarray(at[:, None] + 0.0) + jnp.asarray(during[None] * shutter) / scene.timestep
+    at = np.arange(0, n_steps + 1, chosen.every)
+    during = (np.arange(_MOMENTS) + 0.5) / _MOMENTS - 0.5 if chosen.shutter else np.zeros(1)
+    steps = jnp.asarray(at[:, None] + 0.0) + jnp.asarray(during[None] * chosen.shutter) / scene.timestep
     position, orientation = _placed(scene, trajectory.states, list(looks), steps.ravel())
     colour, opacity = draw_frames(
         list(looks.values()),
@@ -105,11 +129,11 @@ def film(
         orientation,
         camera,
         lights,
-        pixels=pixels,
-        background=background,
-        sampling=sampling,
+        pixels=chosen.pixels,
+        background=chosen.background,
+        sampling=chosen.sampling,
     )
-    if shutter:
+    if chosen.shutter:
         # Light adds up linearly while the shutter is open.
         light = jnp.maximum(colour, 1e-6).reshape(*steps.shape, *colour.shape[1:]) ** GAMMA
         colour = jnp.mean(light, axis=1) ** (1 / GAMMA)

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dano.checks import checked_count, checked_kind, checked_optional
+from dano.checks import checked_kind, checked_optional
 from dano.identification import Identification, identify, IdentifyOptions, Motion, Parameter
 from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
-from dano.progress import Progress
 from dano.scene import Scene
 from dano.vision import (
     adjust_poses,
@@ -33,6 +32,9 @@ _NEARBY = 2.0
 
 _MEDIAN = 5.35
 """Median of the square of six normal numbers, by their standard deviations (χ² of six degrees of freedom)."""
+
+_PASSES = 6
+"""Steps on pixels at most."""
 
 _LIGHT_PASSES = 2
 """Passes in which the light is fitted: after that poses are right, and it would only follow the noise."""
@@ -72,8 +74,6 @@ def identify_in_film(
     *,
     tracking: TrackOptions | None = None,
     background: str | Path | None = None,
-    passes: int = 6,
-    progress: Progress | None = None,
     **settings: Any,
 ) -> FilmFit:
     """Find the parameters of a scene with which its rollout, rendered, looks like a film.
@@ -100,16 +100,13 @@ def identify_in_film(
         tracking: How pixels are compared, as for `track`; without a `table` the scene's level half-space
             below the body is taken for it, if there is one.
         background: Picture of the place without the object.
-        passes: Steps on pixels at most.
-        progress: Told how far it is.
-        **settings: More arguments of `identify`, such as `initial`, `controls` or `options`.
+        **settings: More arguments of `identify`, such as `initial`, `controls`, `options` or `progress`.
 
     Raises:
         ValueError: If the motion is not of one body at the film's times, or as `identify` and `track` say.
     """
     checked_kind("scene", scene, Scene)
     _check(film, look, camera, motion, settings)
-    passes = checked_count("passes", passes)
     tracking = _with_table(
         scene, motion, checked_optional("tracking", tracking, TrackOptions) or TrackOptions()
     )
@@ -117,11 +114,11 @@ def identify_in_film(
     options = checked_optional("options", settings.pop("options", None), IdentifyOptions) or IdentifyOptions()
     # The trend of a rough loss is worth its simulations only where the search ends.
     on_the_way = dataclasses.replace(options, smooth=False)
-    refit = functools.partial(identify, scene, parameters=parameters, progress=progress, **settings)
+    refit = functools.partial(identify, scene, parameters=parameters, **settings)
     before = refit(observed=motion, options=options)
     fit, history, settled, lamps = before, [before.values], False, None
-    found, pulled, more = None, None, {"background": background, "progress": progress}
-    for k in range(passes):
+    found, pulled, more = None, None, {"background": background, "progress": settings.get("progress")}
+    for k in range(_PASSES):
         seen = fit.fitted[0]
         poses = seen.position[:, 0], seen.orientation[:, 0]
         found = adjust_poses(film, look, camera, *poses, tracking, lamps=lamps, **more)

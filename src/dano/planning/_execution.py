@@ -101,8 +101,8 @@ def follow(
         ValueError: If timesteps do not fit.
     """
     began, engine = time.perf_counter(), checked_engine(engine)
-    _check(plant, state, task, plan)
     checked_optional("replanning", replanning, Replanning)
+    _check(plant, state, task, plan)
     substeps = _substeps("plant", plant, plan)
     finer = 1 if replanning is None else _substeps("replanning.scene", replanning.scene, plan)
     scales, n_steps = Scales.of(task), task.n_steps

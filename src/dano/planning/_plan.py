@@ -313,7 +313,7 @@ def _worth(given: _Given, problem: solvers.TrajectoryProblem, solution: solvers.
         for axis in each.axes or "q"
     ]
     return check(
-        priced, jnp.zeros(w.shape[1], w.dtype), mode="forward", labels=labels, directions=len(labels)
+        priced, jnp.zeros(w.shape[1], w.dtype), gradient="forward", labels=labels, directions=len(labels)
     )
 
 

@@ -8,20 +8,10 @@ import numpy as np
 
 from dano import fields, maths, scene
 from dano.checks import shown
-from dano.robots import formats
+from dano.robots import _parts, formats
 from dano.robots._dynamics import balanced, chained, Inertial
 from dano.robots._free import FREE_JOINTS, without_free_laws
 from dano.robots._geometry import checked_collision, shape_of
-from dano.robots._parts import (
-    checked_base,
-    FLOATING,
-    inertials_of,
-    Parts,
-    parts_of,
-    placeholders_of,
-    without_lacking,
-    without_weightless,
-)
 from dano.robots._robot import PLANE, Robot
 
 # Radius of what stands for a link without a shape, in pictures only [m].
@@ -42,24 +32,24 @@ def build_robot(
     """Bodies and joints of what a file says; see `load_urdf`."""
     if not isinstance(prefix, str):
         raise ValueError(f"prefix must be a string, got {shown(prefix)}")
-    place = checked_base(base, description)
+    place = _parts.checked_base(base, description)
     shapes = checked_collision(collision, [link.name for link in description.links])
     ignored = formats.checked_ignore(ignore)
-    description = without_lacking(description, ignored)
+    description = _parts.without_lacking(description, ignored)
     description = without_free_laws(description, ignored=FREE_JOINTS in ignored)
     if balance_inertia:
         description = balanced(description)
-    description = without_weightless(description, ignored)
-    parts = parts_of(description, place)
+    description = _parts.without_weightless(description, ignored)
+    parts = _parts.parts_of(description, place)
     weighed = formats.MASSES not in ignored
-    inertials = inertials_of(parts) if weighed else placeholders_of(parts)
+    inertials = _parts.inertials_of(parts) if weighed else _parts.placeholders_of(parts)
     for note in description.notes:
         warnings.warn(f"{description.source}: {note}", UserWarning, stacklevel=3)
     bodies: list[scene.Body] = []
     frames: Frames = {}
     touching, surroundings = [], []
     places: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    carriers = {joint.parent for joint in description.joints if joint.kind not in ("weld", FLOATING)}
+    carriers = {joint.parent for joint in description.joints if joint.kind not in ("weld", _parts.FLOATING)}
     for name, members in parts.groups.items():
         made = _bodies(parts, name, prefix, shapes, inertials.get(name), weighed=weighed)
         for link, where in members.items():
@@ -72,7 +62,7 @@ def build_robot(
                 places[body.name] = _as_arrays(parts.places[name])
             if name in parts.fixed and description.world is not None and not carriers & set(members):
                 surroundings.append(body.name)
-    moving = [joint for joint in description.joints if joint.kind not in ("weld", FLOATING)]
+    moving = [joint for joint in description.joints if joint.kind not in ("weld", _parts.FLOATING)]
     own = [joint for joint in moving if joint.mimics is None]
     return Robot(
         name=description.name,
@@ -94,7 +84,7 @@ def build_robot(
 
 
 def _bodies(
-    parts: Parts,
+    parts: _parts.Parts,
     name: str,
     prefix: str,
     shapes: Mapping[str, str],

@@ -249,25 +249,6 @@ class Body(eqx.Module):
         nothing = (None, np.zeros(6, self.com.dtype))
         return eqx.tree_at(lambda b: (b.surface, b.extent), self, nothing, is_leaf=lambda x: x is None)
 
-    def collider(self, position: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> contact.Collider:
-        """The body as a contact of shared mass sees it.
-
-        Args:
-            position: Of the centre of mass [m, W].
-            rotation: B → W.
-        """
-        com = self.centre_of_mass
-        arm = -sum(rotation[:, i] * com[i] for i in range(3))
-        return contact.Collider(
-            self.field,
-            self.samples,
-            support=self.support,
-            density_scale=self.density_scale,
-            mass=self.mass * self.mass_scale,
-            rotation=rotation,
-            origin=position + arm,
-        )
-
     def half_space_at(
         self, position: Float[Array | np.ndarray, "3"], orientation: Float[Array | np.ndarray, "4"]
     ) -> tuple[Float[np.ndarray, "3"], float] | None:

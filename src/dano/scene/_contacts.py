@@ -23,7 +23,6 @@ from dano.fields import AbstractShape, HalfSpace, PosedShape, Sphere
 from dano.maths import AnyArray, by_numpy, floating, library, Numbers, Q
 from dano.objects import draw_contact_samples, NeuralObject, surface_quadrature
 from dano.scene._bodies import are_flat, Body, by_geometry, sizes_of
-from dano.scene._states import State
 
 # Edge width of a primitive relative to the size of what touches it: 0.5 % made gradients and rest
 # right, 0.1 % did not.
@@ -142,28 +141,17 @@ def are_on_fixed(first: Any, second: Any, first_fixed: Any, second_fixed: Any) -
     return first & second & (first_fixed | second_fixed)
 
 
-def colliders(
-    bodies: Sequence[Body], contact: Contact, state: State, rotations: Sequence[Float[Array, "3 3"]]
-) -> tuple[Collider, Collider]:
-    """Both sides of a contact at a state, as `AbstractPatchLaw.patch` takes them."""
-    names = [body.name for body in bodies]
-    indices = [names.index(name) for name in (contact.a, contact.b)]
-    pair = [bodies[i] for i in indices]
-    sides = []
-    for i, body, other in zip(indices, pair, reversed(pair), strict=True):
-        side = body.collider(state.position[i], rotations[i])
-        if body.shape is not None:
-            # Against a neural object a primitive has no samples of its own (paper: the sum runs over the
-            # object's).
-            mine = side.samples if other.object is None else None
-            side = eqx.tree_at(
-                lambda c: (c.field, c.samples),
-                side,
-                (_shape_with_edge(body.shape, contact.edge), mine),
-                is_leaf=_none,
-            )
-        sides.append(side)
-    return sides[0], sides[1]
+def colliders(a: Body, b: Body, edge: Float[Array, ""] | None) -> tuple[Collider, Collider]:
+    """Both sides of a contact with a patch law, where shapes have edges of a width."""
+    return _collider(a, b, edge), _collider(b, a, edge)
+
+
+def _collider(body: Body, other: Body, edge: Float[Array, ""] | None) -> Collider:
+    if body.shape is None:
+        return Collider(body.field, body.samples, body.support, body.density_scale)
+    # Against a neural object a primitive has no samples of its own (paper: the sum runs over the object's).
+    samples = body.samples if other.object is None else None
+    return Collider(_shape_with_edge(body.shape, edge), samples, body.support, body.density_scale)
 
 
 def pressing_pairs(bodies: Sequence[Body], ends: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, "pairs 3"]:

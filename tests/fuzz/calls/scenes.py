@@ -51,19 +51,6 @@ def _contact(w: World) -> Iterator[Call]:
         if law is dano.CentroidLaw:
             bad["stiction_velocity"] = OPTIONAL_NON_NEGATIVE
         yield Call(name, law, {}, bad)
-    collider = dano.Collider(dano.Sphere(0.1))
-    yield Call(
-        "Collider",
-        dano.Collider,
-        {"field": dano.Sphere(0.1)},
-        {"field": instance(optional=True), "density_scale": NON_NEGATIVE, "mass": NON_NEGATIVE},
-    )
-    yield Call(
-        "overlap",
-        dano.overlap,
-        {"a": w.ball.collider(jnp.zeros(3), jnp.eye(3)), "b": collider},
-        {"a": instance(), "b": instance()},
-    )
 
 
 def _scenes(w: World) -> Iterator[Call]:

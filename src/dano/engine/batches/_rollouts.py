@@ -20,7 +20,7 @@ from dano.engine.batches._devices import device_mesh, gather, meet, put_rows, pu
 from dano.engine.batches._input import checked_job, Job
 from dano.engine.batches._kernel import Kept, simulate_rows
 from dano.engine.batches._store import RolloutStore
-from dano.names import see
+from dano.names import did_you_mean, see
 from dano.progress import Progress
 from dano.scene import Control, JOINT_QUANTITIES, Scene, State, STATE_SIZES
 
@@ -111,8 +111,24 @@ def load_rollouts(path: str | os.PathLike[str]) -> StoredRollouts:
     return StoredRollouts(path)
 
 
-class _Options(TypedDict, total=False):
-    """Options of `rollouts` that do not decide what it returns."""
+class RolloutOptions(TypedDict, total=False):
+    """What is rolled out, how much at once, and what is kept of it: options of `rollouts`.
+
+    Attributes:
+        parameters: Arrays with a leading axis, or a tree of them: what `scene`, a function, is called with,
+            row by row.
+        controls: Forces and torques, leaves of shape (r, n_steps, n_bodies, 3), or (n_steps, n_bodies, 3) for
+            all, or a function of (state, time [s]), as in `simulate`.
+        engine: Default `VariationalEngine()`.
+        keep: Which states to keep: "all" (the default), "last", or a number k: the first, every k-th and the
+            last.
+        batch_size: Rollouts that a device simulates at once; default 32 on a CPU, where more of them leave
+            the cache, and 8192 elsewhere.
+        chunk_size: Rollouts between two calls of `progress`, and in a file; a multiple of `batch_size`.
+            Default up to eight batches, fewer if few rollouts share many devices or much is kept.
+        devices: Some of `jax.local_devices()`; default all.
+        progress: Called with a description and the share done.
+    """
 
     parameters: Any
     controls: Control | Policy | None
@@ -131,7 +147,7 @@ def rollouts(
     n_steps: int | None = None,
     *,
     path: None = None,
-    **options: Unpack[_Options],
+    **options: Unpack[RolloutOptions],
 ) -> Rollouts: ...
 @overload
 def rollouts(
@@ -140,22 +156,15 @@ def rollouts(
     n_steps: int | None = None,
     *,
     path: str | os.PathLike[str],
-    **options: Unpack[_Options],
+    **options: Unpack[RolloutOptions],
 ) -> StoredRollouts: ...
 def rollouts(
     scene: Scene | Callable[[Any], Scene],
     states: State,
     n_steps: int | None = None,
     *,
-    parameters: Any = None,
-    controls: Control | Policy | None = None,
-    engine: AbstractEngine | None = None,
-    keep: str | int = "all",
     path: str | os.PathLike[str] | None = None,
-    batch_size: int | None = None,
-    chunk_size: int | None = None,
-    devices: Sequence[Any] | None = None,
-    progress: Progress | None = None,
+    **options: Unpack[RolloutOptions],
 ) -> Rollouts | StoredRollouts:
     """Roll out many times: over states, parameters and controls, on all devices of this process.
 
@@ -167,24 +176,13 @@ def rollouts(
 
     Args:
         scene: The scene; or one per rollout, every array in it with a leading axis, as `jax.vmap` makes them
-            (copies of everything); or a function that makes the scene of a row of `parameters`, which
-            copies nothing.
+            (copies of everything); or a function that makes the scene of a row of the option `parameters`,
+            which copies nothing.
         states: Initial states, leaves of shape (r, n_bodies, ·), or (n_bodies, ·) for all.
-        n_steps: Number of steps; may be left out if `controls` are arrays.
-        parameters: Arrays with a leading axis, or a tree of them: what `scene`, a function, is called with,
-            row by row.
-        controls: Forces and torques, leaves of shape (r, n_steps, n_bodies, 3), or (n_steps, n_bodies, 3)
-            for all, or a function of (state, time [s]), as in `simulate`.
-        engine: Default `VariationalEngine()`.
-        keep: Which states to keep: "all", "last", or a number k: the first, every k-th and the last.
+        n_steps: Number of steps; may be left out if the option `controls` holds arrays.
         path: Folder to write to, chunk by chunk, instead of memory (extra `batch`). If it is there, complete
             chunks are kept and the others simulated. Processes need a file system that all of them see.
-        batch_size: Rollouts that a device simulates at once; default 32 on a CPU, where more of them leave
-            the cache, and 8192 elsewhere.
-        chunk_size: Rollouts between two calls of `progress`, and in a file; a multiple of `batch_size`.
-            Default up to eight batches, fewer if few rollouts share many devices or much is kept.
-        devices: Some of `jax.local_devices()`; default all.
-        progress: Called with a description and the share done.
+        **options: Of `RolloutOptions`.
 
     Returns:
         All rollouts; with `path` what opens them. Rollouts with steps that did not converge are marked, and
@@ -194,16 +192,22 @@ def rollouts(
         ValueError: If numbers of rows differ, something does not fit the scene, an option is out of range,
             or `path` holds something else, or rollouts of another scene or with other settings.
         ImportError: With `path` and without the extra `batch`.
+        TypeError: If an option is unknown.
     """
-    mesh = device_mesh(devices)
-    for name, size in (("batch_size", batch_size), ("chunk_size", chunk_size)):
+    known = RolloutOptions.__annotations__
+    if wrong := [name for name in options if name not in known]:
+        raise TypeError(f"rollouts has no option {wrong[0]!r}{did_you_mean(wrong[0], known)}")
+    mesh = device_mesh(options.get("devices"))
+    sizes = options.get("batch_size"), options.get("chunk_size")
+    for name, size in zip(("batch_size", "chunk_size"), sizes, strict=True):
         if size is not None:
             checked_count(name, size)
     if path is not None:
         checked_path("path", path)
-    tell = checked_progress(progress)
-    job = checked_job(scene, states, n_steps, parameters, controls, checked_engine(engine), keep)
-    batch, chunk = _sizes(job, mesh, batch_size, chunk_size)
+    tell, engine = checked_progress(options.get("progress")), checked_engine(options.get("engine"))
+    given = options.get("parameters"), options.get("controls")
+    job = checked_job(scene, states, n_steps, *given, engine, options.get("keep", "all"))
+    batch, chunk = _sizes(job, mesh, *sizes)
     if path is None:
         kept = _into_memory(job, mesh, batch, chunk, tell)
         result = _result(kept, job.steps, job.names)

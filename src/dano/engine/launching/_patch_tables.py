@@ -34,7 +34,7 @@ from dano.fields import (
     UnionField,
 )
 from dano.native import balls_around_runs, leaves_of, PlacedField
-from dano.scene import colliders, Scene, State
+from dano.scene import colliders, Scene
 
 # Shapes with an outward direction of their own; that of others is the gradient of their distance.
 _OWN_DIRECTION = (Sphere, Capsule, Ellipsoid)
@@ -45,7 +45,7 @@ class PatchPair(NamedTuple):
 
     first: int  # Index of the body that the wrench acts on
     second: int  # Index of the other body
-    a: Collider  # The first body; its pose is not read
+    a: Collider  # The first body
     b: Collider  # The second body
     params: ContactParams  # Parameters of the law
     law: AbstractPatchLaw  # The law
@@ -76,20 +76,12 @@ def patch_pairs(scene: Scene) -> list[PatchPair]:
     Raises:
         ValueError: If kernels do not know one of the laws.
     """
-    contacts = [contact for contact in scene.contacts if isinstance(contact.law, AbstractPatchLaw)]
-    if not contacts:
-        return []
-    n = len(scene.bodies)
-    dtype = scene.timestep.dtype
-    unturned = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0], dtype), (n, 1))
-    still = State(jnp.zeros((n, 3), dtype), unturned, jnp.zeros((n, 3), dtype), jnp.zeros((n, 3), dtype))
-    rotations = [jnp.eye(3, dtype=dtype)] * n
     found = []
-    for contact in contacts:
-        a, b = colliders(scene.bodies, contact, still, rotations)
-        first, second = scene.index(contact.a), scene.index(contact.b)
-        assert isinstance(contact.law, AbstractPatchLaw)
-        found.append(PatchPair(first, second, a, b, contact.params, contact.law))
+    for contact in scene.contacts:
+        if isinstance(contact.law, AbstractPatchLaw):
+            first, second = scene.index(contact.a), scene.index(contact.b)
+            a, b = colliders(scene.bodies[first], scene.bodies[second], contact.edge)
+            found.append(PatchPair(first, second, a, b, contact.params, contact.law))
     return found
 
 

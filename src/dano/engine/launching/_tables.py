@@ -8,23 +8,13 @@ import jax
 import numpy as np
 from jaxtyping import DTypeLike, Float, Int
 
+from dano import native
 from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Materials, materials, SurfaceSet
 from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
 from dano.engine.launching._builds import build_for
 from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchRows
 from dano.engine.launching._plans import WholeNumbers
 from dano.maths import AnyArray, is_traced, library
-from dano.native import (
-    balls_around_runs,
-    Features,
-    fields_of,
-    is_known,
-    kinds_of,
-    leaf_tables,
-    leaves_of,
-    PlacedField,
-    slabs_of_blocks,
-)
 from dano.scene import Body, pressing_pairs, Scene
 
 # Samples count as near within this share of the smaller body's size, besides the way they go.
@@ -36,7 +26,9 @@ _THIN = 0.25
 # Momentum that the damper of an impact passes on, see `dano.physics.impacts.Impact`: half the size over the
 # depth of the impact, within bounds. Where that is shallow, what has sunk in has to stop all of what comes.
 _SOFTEST, _HARDEST = 100.0, 1e4
-# Another part of a body, whose impact is left to the next step, gets in by at most this share of the size.
+# Another part of a body, whose impact is left to the next step, gets in by at most this share of the size; by
+# no more than an impact is deep where both bodies move. There a third one may keep what is left from waiting:
+# deep contact without an impact takes many passes.
 _DEEPEST = 0.04
 _STRUCTURES = "dano.engine.kernels.tables"
 # How samples turn with their body: see `dano.physics.pairs`.
@@ -53,7 +45,7 @@ class Tables(eqx.Module):
     # Real numbers by place in a kernel's parameters, arrays of rows.
     rows: dict[str, Float[AnyArray, "rows width"]]
     whole: WholeNumbers = eqx.field(static=True)  # Whole numbers (static)
-    features: Features = eqx.field(static=True)  # What kernels must know of the scene (static)
+    features: native.Features = eqx.field(static=True)  # What kernels must know of the scene (static)
     structure: TreeStructure = eqx.field(static=True)  # Kinematic trees and loops (static)
 
     @property
@@ -71,9 +63,9 @@ def knows(scene: Scene) -> bool:
     """Whether kernels make the steps of a scene: they know its laws, its solids and its densities."""
     patches = {name for c in scene.contacts if isinstance(c.law, AbstractPatchLaw) for name in (c.a, c.b)}
     laws = all(type(c.law) is DistributedLaw or knows_law(c.law) for c in scene.contacts)
-    solids = all(body.solid is None or is_known(body.solid) for body in scene.bodies)
+    solids = all(body.solid is None or native.is_known(body.solid) for body in scene.bodies)
     queried = [body.field for body in scene.bodies if body.name in patches]
-    return laws and solids and all(field is None or is_known(field) for field in queried)
+    return laws and solids and all(field is None or native.is_known(field) for field in queried)
 
 
 def _own_law(scene: Scene) -> str:
@@ -85,13 +77,13 @@ def _own_law(scene: Scene) -> str:
     return files.pop() if files else ""
 
 
-def packed(features: Features, struct: str, **fields: AnyArray) -> Float[AnyArray, "rows width"]:
+def packed(features: native.Features, struct: str, **fields: AnyArray) -> Float[AnyArray, "rows width"]:
     """Rows of a structure of `dano.engine.kernels.tables`, from arrays of its fields with an axis of rows.
 
     Raises:
         ValueError: If a field is missing or too much.
     """
-    names = list(fields_of(features, _STRUCTURES, struct))
+    names = list(native.fields_of(features, _STRUCTURES, struct))
     if set(names) != set(fields):
         raise ValueError(f"fields must be {names}, got {list(fields)}")
     n = fields[names[0]].shape[0]
@@ -124,14 +116,14 @@ def scene_tables(scene: Scene) -> Tables:
     leaves = [*solids, *patches.leaves]
     unions = patches.unions or any(count > 1 for _, count in solid_index)
     features = build_for(
-        kinds_of(leaves),
+        native.kinds_of(leaves),
         law=_own_law(scene),
         unions=unions,
         patches=len(patches.pair_index) > 0,
         trees=bool(scene.joints),
     )
     surfaces, surface_index = _surfaces(scene, bodies, dtype)
-    of_leaves = leaf_tables(leaves, dtype)
+    of_leaves = native.leaf_tables(leaves, dtype)
     touching = used | {int(i) for row in patches.pair_index for i in row[:2]}
     structure = structure_of_trees(scene, touching)
     index = [[row, *surface_index[i], *solid_index[i]] for i, row in enumerate(structure.rows)]
@@ -218,13 +210,13 @@ def _strength(scene: Scene) -> Float[AnyArray, ""]:
 def _materials(
     groups: Sequence[tuple[DistributedLaw, ContactParams]],
     scene: Scene,
-    features: Features,
+    features: native.Features,
     dtype: DTypeLike,
 ) -> Float[AnyArray, "contacts width"]:
     if not groups:
         return np.zeros((0, len(Materials._fields)), dtype)
     fields = materials(groups, scene.timestep, _strength(scene))._asdict()
-    if "numbers" in fields_of(features, _STRUCTURES, "Material"):
+    if "numbers" in native.fields_of(features, _STRUCTURES, "Material"):
         xp = library(*(law.numbers for law, _ in groups))
         rows = [xp.broadcast_to(law.numbers, (p.sliding_friction.size, 3)) for law, p in groups]
         fields["numbers"] = xp.concatenate(rows).astype(dtype)
@@ -255,19 +247,19 @@ def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
     rows = {
         "scene.samples": xp.concatenate([points_of, vectors], axis=1),
         "scene.balls": balls,
-        "scene.slabs": slabs_of_blocks(points_of, vectors, centers),
-        "scene.runs": balls_around_runs(balls),
+        "scene.slabs": native.slabs_of_blocks(points_of, vectors, centers),
+        "scene.runs": native.balls_around_runs(balls),
     }
     return rows, index
 
 
 def _solids(
     scene: Scene, used: set[int], dtype: DTypeLike
-) -> tuple[list[PlacedField], list[tuple[int, int]]]:
+) -> tuple[list[native.PlacedField], list[tuple[int, int]]]:
     """Leaves of each different solid in use, and for each body where its own begin and how many they are."""
     twins = scene.twins or tuple(range(len(scene.bodies)))
     first: dict[int, tuple[int, int]] = {}
-    leaves: list[PlacedField] = []
+    leaves: list[native.PlacedField] = []
     index = []
     for i, body in enumerate(scene.bodies):
         solid = body.solid if i in used else None
@@ -275,7 +267,7 @@ def _solids(
             index.append((0, 0))
             continue
         if twins[i] not in first:
-            parts = leaves_of(PlacedField.still(solid, dtype))
+            parts = native.leaves_of(native.PlacedField.still(solid, dtype))
             first[twins[i]] = len(leaves), len(parts)
             leaves += parts
         index.append(first[twins[i]])
@@ -306,7 +298,7 @@ def _known_of_pairs(
     bodies: Sequence[Body],
     pairs: Int[np.ndarray, "k 3"],
     extents: Float[AnyArray, "n 6"],
-    features: Features,
+    features: native.Features,
 ) -> _KnownOfPairs:
     """What is known of pairs, one row for all pairs of bodies that are alike."""
     dtype = extents.dtype
@@ -346,7 +338,10 @@ def _kinds_of_bodies(
     columns = [] if others is None else jax.tree.leaves((others.params, others.of_edges))
     if is_traced(extents, columns) or n == 0:
         return np.arange(n)
-    told = [np.array([body.surface is not None and body.surface.turning != "fixed" for body in bodies])]
+    told = [
+        np.array([body.surface is not None and body.surface.turning != "fixed" for body in bodies]),
+        np.array([body.fixed for body in bodies]),
+    ]
     if others is not None:
         told += [np.array(x) for x in (others.flat, others.shapes, others.fixed)]
     numbers = [np.asarray(x, float).reshape(n, -1) for x in (extents, *columns, *told)]
@@ -384,7 +379,7 @@ def _pairs(
     index: Int[np.ndarray, "k 5"],
     share: Float[np.ndarray, " k"],
     extents: Float[AnyArray, "n 6"],
-    features: Features,
+    features: native.Features,
 ) -> Float[AnyArray, "k 7"]:
     """Rows of pairs whose first body's samples press on the second's solid, which have shares of contacts."""
     dtype, h = extents.dtype, scene.timestep
@@ -396,14 +391,17 @@ def _pairs(
     size, thickness = xp.minimum(extents[first, 4:], extents[second, 4:]).T
     gravity_step = _strength(scene) * h * h
     depths = _impact_depths(groups, dtype)[material]
+    impact_depth = xp.minimum(depths, _THIN * thickness)
+    moves = np.array([not body.fixed for body in bodies])
+    deepest = xp.minimum(_DEEPEST * size, _THIN * thickness)
     return packed(
         features,
         "SamplePair",
         share=share.astype(dtype),
         follows=(smooth[second] & ~smooth[first]).astype(dtype),
         sink=xp.minimum(_SINK * size, _THIN * thickness),
-        impact_depth=xp.minimum(depths, _THIN * thickness),
+        impact_depth=impact_depth,
         factor=xp.clip(0.5 * size / depths, _SOFTEST, _HARDEST),
-        deepest=xp.minimum(_DEEPEST * size, _THIN * thickness),
+        deepest=xp.where(moves[first] & moves[second], impact_depth, deepest),
         margin=_MARGIN * size + 2 * gravity_step.astype(dtype),
     )

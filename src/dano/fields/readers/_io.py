@@ -110,22 +110,18 @@ _READERS: dict[str, _Format] = {
 }
 
 
-MODEL_FORMATS = ("dano-osf", "dano-hash-model", "dano-learned-field")
-"""Formats of files of what was learned from photographs."""
+_LEARNED = "dano-learned-field"
+"""Format of files of what was learned from photographs."""
 
-_model_readers: list[Callable[[Path], Any]] = []
-
-
-def offer_models(read: Callable[[Path], Any]) -> None:
-    """Say what reads a file of `MODEL_FORMATS`: `dano.vision`, of which fields know nothing.
-
-    Args:
-        read: Gives a field, or something with a method `field`.
-    """
-    _model_readers[:] = [read]
+_learned_readers: list[Callable[[Path], AbstractField]] = []
 
 
-FIELD_FORMATS = FIELD[0], *MODEL_FORMATS
+def offer_learned(read: Callable[[Path], AbstractField]) -> None:
+    """Say what reads a field that was learned from photographs: fields know nothing of `dano.vision`."""
+    _learned_readers[:] = [read]
+
+
+FIELD_FORMATS = FIELD[0], _LEARNED
 """What files of dano that `load_field` reads say that they hold."""
 
 FIELD_SUFFIXES = tuple(_READERS)
@@ -147,8 +143,7 @@ def load_field(
     """Read a field from a file; nothing is ever unpickled.
 
     - `.npz`: `values` (nx, ny, nz), or signed `distances`, with `origin` (3,) and `spacing`; option
-      `interpolation`. Or what the models of `dano.vision` write: `LearnedField` (`dano train` does), `OSF`,
-      `HashModel`.
+      `interpolation`. Or what `LearnedField.save` (`dano train`) writes.
     - `.npy`: voxels (nx, ny, nz), booleans or densities; options `spacing`, `origin`, `interpolation`, and
       `signed_distance=True` if they are distances, negative inside.
     - `.obj`, `.stl`, `.off`, `.glb`, `.gltf`, `.ply`, `.3mf`, `.dae`, `.step`: a triangle mesh; options of
@@ -243,24 +238,18 @@ def _of_unit(path: str | Path, crop: np.ndarray | None, options: dict[str, Any])
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "no such file"
         raise ValueError(f"{path}: {what}; expected a field ({', '.join(_READERS)})")
-    if suffix == ".npz" and (form := format_of(path)) in MODEL_FORMATS:
-        _check_options(path, f"{form} file", options, ())
-        return _of_model(path, crop)
+    if suffix == ".npz" and format_of(path) == _LEARNED:
+        _check_options(path, f"{_LEARNED} file", options, ())
+        if crop is not None:
+            raise ValueError(f"{path}: what was learned has a box of its own, got crop {crop.tolist()}")
+        (read,) = _learned_readers
+        return read(path)
     reader = _SPLATS if suffix == ".ply" else _READERS[suffix]
     _check_options(path, f"{suffix} file", options, reader.options)
     if reader.crops:
         return reader.read(path, crop=crop, **options)
     field = reader.read(path, **options)
     return field if crop is None else _cropped(field, crop, path)
-
-
-def _of_model(path: Path, crop: np.ndarray | None) -> AbstractField:
-    """The density of a model that was learned from photographs."""
-    (read,) = _model_readers
-    model = read(path)
-    if crop is not None:
-        raise ValueError(f"{path}: {type(model).__name__} has a box of its own, got crop {crop.tolist()}")
-    return model if isinstance(model, AbstractField) else model.field()
 
 
 def _check_options(what: object, kind: str, options: dict[str, Any], known: tuple[str, ...]) -> None:

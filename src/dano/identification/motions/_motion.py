@@ -114,31 +114,25 @@ class Motion:
         times: Numbers,
         names: str | Sequence[str],
         *,
-        position: Numbers | None = None,
-        orientation: Numbers | None = None,
-        velocity: Numbers | None = None,
-        omega: Numbers | None = None,
         point: str = "com",
         lag: float = 0.0,
         covariance: Numbers | None = None,
         alike: Numbers | None = None,
-        q: Numbers | None = None,
+        **observed: Numbers | None,
     ) -> "Motion":
         """A motion from arrays of shape (T, n, ·), or (T, ·) for a single body.
 
         Args:
             times: [s], shape (T,).
             names: Name or names of the bodies.
-            position: [m, W]; NaN where a body was not seen.
-            orientation: Quaternions wxyz, body → world, normalised here, with signs that do not jump; NaN
-                where unknown.
-            velocity: [m/s, W].
-            omega: [rad/s, B].
             point: What positions and velocities refer to: "com" or "origin".
             lag: How long before a frame its velocities hold [s].
             covariance: Of each pose, as a tracker gives it, shape (T, n, 6, 6), or (T, 6, 6) for one body.
             alike: By how much poses may be off in all frames alike, see the attribute; needs `covariance`.
-            q: Joint coordinates of each body, see the attribute; `motion_of_joints` makes them.
+            **observed: `position` [m, W], `orientation` (quaternions wxyz, body → world, normalised here,
+                with signs that do not jump), `velocity` [m/s, W], `omega` [rad/s, B]; and `q`, the joint
+                coordinates of each body, see the attribute (`motion_of_joints` makes them). NaN where a body
+                was not seen.
 
         Raises:
             ValueError: If there are fewer than two frames, times do not increase, nothing was observed, or an
@@ -156,8 +150,10 @@ class Motion:
             raise ValueError(f"times must be finite and increase, got {stamps[bad]} s at frame {bad}")
         checked_choice("point", point, ("com", "origin"))
         lag = checked_number("lag", lag, least=0)
-        given = {"position": position, "orientation": orientation, "velocity": velocity, "omega": omega}
-        arrays = {name: _frames(name, value, len(stamps), len(names)) for name, value in given.items()}
+        for name in observed:
+            checked_choice("observed", name, (*QUANTITIES, "q"))
+        q = observed.get("q")
+        arrays = {name: _frames(name, observed.get(name), len(stamps), len(names)) for name in QUANTITIES}
         for row, name in enumerate(names):
             if not any(np.isfinite(arrays[key][:, row]).all(axis=-1).any() for key in QUANTITIES):
                 raise ValueError(f"motion of {name!r} must hold at least one observed frame, got none")

@@ -12,19 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.checks import checked_kind, checked_text
-from dano.identification.wrench._estimate import (
-    check_slip,
-    drifting,
-    fitted,
-    Load,
-    load_of,
-    LoadFit,
-    point_masses,
-    Rows,
-    shares,
-    UNSURE,
-    wrench_table,
-)
+from dano.identification.wrench import _estimate
 from dano.identification.wrench._log import surroundings, Twists, twists, WristLog
 from dano.maths import checked_numbers, Numbers, quat_to_matrix
 from dano.robots import computed_torque
@@ -75,7 +63,9 @@ class JointLog:
         return JointLog(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
 
-def identify_load_on_arm(log: JointLog, scene: Scene, body: str, *, shape: Numbers | None = None) -> Load:
+def identify_load_on_arm(
+    log: JointLog, scene: Scene, body: str, *, shape: Numbers | None = None
+) -> _estimate.Load:
     """Mass, centre of mass and inertia of what an arm holds, from the torques that move its joints.
 
     The torques are those of the arm alone, M(q) v̇ + b(q, v) by the scene, and Jᵀ of the force and torque by
@@ -108,19 +98,21 @@ def identify_load_on_arm(log: JointLog, scene: Scene, body: str, *, shape: Numbe
         raise ValueError(
             f"log must have a column for each of the scene's {count} joints, got {log.q.shape[1]}"
         )
-    points = None if shape is None else point_masses(checked_numbers("shape", shape))
+    points = None if shape is None else _estimate.point_masses(checked_numbers("shape", shape))
     arm = _moved(log, scene, index)
-    table = np.einsum("nik,nip->nkp", arm.jacobian, wrench_table(arm.twists, np.asarray(scene.gravity)))
+    table = np.einsum(
+        "nik,nip->nkp", arm.jacobian, _estimate.wrench_table(arm.twists, np.asarray(scene.gravity))
+    )
     each = np.broadcast_to(np.eye(count), (len(table), count, count))
     # Coulomb's friction of a joint that hardly moves has no sign: a smooth one.
     columns = [each, np.tanh(arm.v / _SLOW)[:, :, None] * each, arm.v[:, :, None] * each]
-    rows = Rows(
-        shares(log.times, arm.twists.rows),
+    rows = _estimate.Rows(
+        _estimate.shares(log.times, arm.twists.rows),
         log.torque[arm.twists.rows] - arm.torque,
         np.concatenate([table, *columns], axis=2),
         np.arange(count),
     )
-    rows, fit, change = drifting(rows, fitted(rows))
+    rows, fit, change = _estimate.drifting(rows, _estimate.fitted(rows))
     messages = []
     if change is not None:
         largest = int(np.argmax(np.abs(change)))
@@ -134,25 +126,26 @@ def identify_load_on_arm(log: JointLog, scene: Scene, body: str, *, shape: Numbe
             f" {fit.theta[0]:.3g} kg"
         )
     if fit.null[:4].max() < 1e-3 and fit.theta[0] > 0:
-        check_slip(rows, fit, log.times)
-
+        _estimate.check_slip(rows, fit, log.times)
     drift = np.zeros(count) if change is None else change
+    return _estimate.load_of(fit, messages, points, lambda theta: _of_joints(fit, theta, drift))
 
-    def sensor(theta: np.ndarray) -> dict:
-        nothing, joints = np.full(3, np.nan), theta[10 : 10 + 3 * count].reshape(3, count)
-        return {
-            "force_bias": nothing,
-            "torque_bias": nothing,
-            "drift": np.full(6, np.nan),
-            "force_noise": float("nan"),
-            "torque_noise": float("nan"),
-            "joint_bias": joints[0],
-            "joint_friction": joints[1:].T,
-            "joint_noise": fit.noise,
-            "joint_drift": drift,
-        }
 
-    return load_of(fit, messages, points, sensor)
+def _of_joints(fit: _estimate.LoadFit, theta: np.ndarray, drift: np.ndarray) -> dict[str, Any]:
+    """Bias, friction, drift and noise of joints, as fields of a load; a wrist's are not known."""
+    nothing, count = np.full(3, np.nan), len(drift)
+    joints = theta[10 : 10 + 3 * count].reshape(3, count)
+    return {
+        "force_bias": nothing,
+        "torque_bias": nothing,
+        "drift": np.full(6, np.nan),
+        "force_noise": float("nan"),
+        "torque_noise": float("nan"),
+        "joint_bias": joints[0],
+        "joint_friction": joints[1:].T,
+        "joint_noise": fit.noise,
+        "joint_drift": drift,
+    }
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -218,7 +211,7 @@ _BETTER = 0.7
 
 def identify_load(
     log: WristLog, *, gravity: Numbers = (0.0, 0.0, -9.81), shape: Numbers | None = None
-) -> Load:
+) -> _estimate.Load:
     """Mass, centre of mass and inertia of a rigid load from what a wrist's sensor felt while it moved it.
 
     The sensor holds the load at its origin with the force f and the torque τ, in its axes,
@@ -251,19 +244,19 @@ def identify_load(
     if pull.shape != (3,) or not np.isfinite(pull).all():
         raise ValueError(f"gravity must be three numbers [m/s²], got {gravity}")
     moved = twists(log)
-    bodies = None if shape is None else point_masses(checked_numbers("shape", shape))
+    bodies = None if shape is None else _estimate.point_masses(checked_numbers("shape", shape))
     rows = _rows(log, moved, pull)
-    fit = fitted(rows)
+    fit = _estimate.fitted(rows)
     messages: list[str] = []
     if _turns(moved):
-        other = fitted(_rows(log.of_sensor(), moved, pull))
+        other = _estimate.fitted(_rows(log.of_sensor(), moved, pull))
         if other.noise[0] < _BETTER * fit.noise[0]:
             raise ValueError(
                 "force and torque must be in the sensor's axes: those of this log fit in world axes, with"
                 f" a noise of {other.noise[0]:.2g} N in place of {fit.noise[0]:.2g} N; frame='world' reads"
                 " them so"
             )
-    rows, fit, change = drifting(rows, fit)
+    rows, fit, change = _estimate.drifting(rows, fit)
     if change is not None:
         messages.append(
             f"the bias drifts, by {np.linalg.norm(change[:3]):.2g} N and {np.linalg.norm(change[3:]):.2g} N m"
@@ -275,19 +268,19 @@ def identify_load(
         fit = dataclasses.replace(fit, theta=-fit.theta)
     _check(log, rows, fit)
     drift = np.zeros(6) if change is None else change
-    return load_of(fit, messages, bodies, lambda theta: _sensor(fit, theta, drift))
+    return _estimate.load_of(fit, messages, bodies, lambda theta: _sensor(fit, theta, drift))
 
 
-def _rows(log: WristLog, moved: Twists, gravity: np.ndarray) -> Rows:
+def _rows(log: WristLog, moved: Twists, gravity: np.ndarray) -> _estimate.Rows:
     """The model of a wrist's log: after the load the bias of each reading."""
     rows = moved.rows
     bias = np.broadcast_to(np.eye(6), (len(rows), 6, 6))
-    table = np.concatenate([wrench_table(moved, gravity), bias], axis=2)
+    table = np.concatenate([_estimate.wrench_table(moved, gravity), bias], axis=2)
     readings = np.concatenate([log.force[rows], log.torque[rows]], axis=1)
-    return Rows(shares(log.times, rows), readings, table, np.repeat([0, 1], 3))
+    return _estimate.Rows(_estimate.shares(log.times, rows), readings, table, np.repeat([0, 1], 3))
 
 
-def _sensor(fit: LoadFit, theta: np.ndarray, drift: np.ndarray) -> dict[str, Any]:
+def _sensor(fit: _estimate.LoadFit, theta: np.ndarray, drift: np.ndarray) -> dict[str, Any]:
     """Bias, drift and noise, as fields of a load."""
     return {
         "force_bias": theta[10:13],
@@ -304,7 +297,7 @@ def _turns(moved: Twists) -> bool:
     return bool(2 * np.arccos(np.clip(cosine.min(), 0, 1)) > 0.2)
 
 
-def _check(log: WristLog, rows: Rows, fit: LoadFit) -> None:
+def _check(log: WristLog, rows: _estimate.Rows, fit: _estimate.LoadFit) -> None:
     """Refuse torques in other units, and loads that slip.
 
     Raises:
@@ -312,7 +305,7 @@ def _check(log: WristLog, rows: Rows, fit: LoadFit) -> None:
     """
     mass, arm = fit.theta[0], fit.theta[1:4]
     error = np.sqrt(fit.inflation * fit.covariance[0, 0])
-    if fit.null[:4].max() > 1e-3 or mass < error / UNSURE:
+    if fit.null[:4].max() > 1e-3 or mass < error / _estimate.UNSURE:
         return
     if (far := float(np.linalg.norm(arm / mass))) > _FAR:
         raise ValueError(
@@ -320,10 +313,10 @@ def _check(log: WristLog, rows: Rows, fit: LoadFit) -> None:
             " divide N mm by 1000"
         )
     _check_units(rows, fit)
-    check_slip(rows, fit, log.times)
+    _estimate.check_slip(rows, fit, log.times)
 
 
-def _check_units(rows: Rows, fit: LoadFit) -> None:
+def _check_units(rows: _estimate.Rows, fit: _estimate.LoadFit) -> None:
     """Refuse torques of a centre of mass that is much further away, or nearer, than that of the forces.
 
     Raises:
@@ -331,7 +324,7 @@ def _check_units(rows: Rows, fit: LoadFit) -> None:
     """
     alone = rows.table[:, :, 1:4].copy()
     alone[:, :3] = 0.0
-    split = fitted(rows.beside(alone))
+    split = _estimate.fitted(rows.beside(alone))
     of_forces = float(np.linalg.norm(split.theta[1:4]))
     of_torques = float(np.linalg.norm(split.theta[1:4] + split.theta[-3:]))
     ratio = of_torques / max(of_forces, 1e-300)

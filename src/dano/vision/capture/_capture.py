@@ -15,36 +15,29 @@ SPLITS = ("train", "test", "relight")
 
 
 class View(eqx.Module):
-    """One photograph.
+    """One photograph."""
 
-    Attributes:
-        name: Of the file, for messages and reports (static).
-        camera: Where and with what it was taken.
-        image: sRGB in [0, 1] as photographed, or over black where the file has an alpha channel, in float32,
-            shape (height, width, 3).
-        mask: Share of each pixel that the object covers, (height, width); None if it is not known.
-        light: Unit direction towards the light [W], or its position [m, W] if `light_is_near`; None if it is
-            not known, as under light that stays the same.
-        light_is_near: Whether `light` is a position (static).
-        split: One of `SPLITS` (static).
-        cut_out: Whether `image` shows the object alone, over black (static).
-        background: Colour that it was photographed against, if that is plain and known, shape (3,).
-        doubt: How far the mask of each pixel may be wrong, (height, width): 1 where the mask says nothing and
-            colours decide (see `with_doubts`); None for nowhere.
-        behind: What each pixel would show without the object, sRGB, (height, width, 3), NaN where that is not
-            known (see `with_table`); None: `background` everywhere.
-    """
-
-    name: str = eqx.field(static=True)
-    camera: PosedCamera
+    name: str = eqx.field(static=True)  # Of the file, for messages and reports (static)
+    camera: PosedCamera  # Where and with what it was taken
+    # sRGB in [0, 1] as photographed, or over black where the file has an alpha channel, in float32, shape
+    # (height, width, 3).
     image: Float[np.ndarray, "height width 3"]
+    # Share of each pixel that the object covers, (height, width); None if it is not known.
     mask: Float[np.ndarray, "height width"] | None = None
+    # Unit direction towards the light [W], or its position [m, W] if `light_is_near`; None if it is not
+    # known, as under light that stays the same.
     light: Float[np.ndarray, "3"] | None = None
-    light_is_near: bool = eqx.field(static=True, default=False)
-    split: str = eqx.field(static=True, default="train")
+    light_is_near: bool = eqx.field(static=True, default=False)  # Whether `light` is a position (static)
+    split: str = eqx.field(static=True, default="train")  # One of `SPLITS` (static)
+    # Whether `image` shows the object alone, over black (static).
     cut_out: bool = eqx.field(static=True, default=False)
+    # Colour that it was photographed against, if that is plain and known, shape (3,).
     background: Float[np.ndarray, "3"] | None = None
+    # How far the mask of each pixel may be wrong, (height, width): 1 where the mask says nothing and colours
+    # decide (see `with_doubts`); None for nowhere.
     doubt: Float[np.ndarray, "height width"] | None = None
+    # What each pixel would show without the object, sRGB, (height, width, 3), NaN where that is not known
+    # (see `with_table`); None: `background` everywhere.
     behind: Float[np.ndarray, "height width 3"] | None = None
 
     @property

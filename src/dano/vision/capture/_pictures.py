@@ -29,21 +29,14 @@ _STRAIGHT = 3 / 255
 
 
 class Picture(NamedTuple):
-    """A picture as its file has it, turned as it was asked for.
+    """A picture as its file has it, turned as it was asked for."""
 
-    Attributes:
-        colours: sRGB in [0, 1], in float32.
-        alpha: Share of each pixel that is opaque; None where nothing is transparent.
-        premultiplied: Whether colours are stored multiplied by alpha.
-        orientation: EXIF's: 1 if pixels are stored upright, 5 to 8 if turned by a quarter.
-        focal: Focal length that the camera states [pixels]; None if it states none.
-    """
-
-    colours: Float[np.ndarray, "height width 3"]
+    colours: Float[np.ndarray, "height width 3"]  # sRGB in [0, 1], in float32
+    # Share of each pixel that is opaque; None where nothing is transparent.
     alpha: Float[np.ndarray, "height width"] | None
-    premultiplied: bool
-    orientation: int
-    focal: float | None
+    premultiplied: bool  # Whether colours are stored multiplied by alpha
+    orientation: int  # EXIF's: 1 if pixels are stored upright, 5 to 8 if turned by a quarter
+    focal: float | None  # Focal length that the camera states [pixels]; None if it states none
 
     @property
     def over_black(self) -> Float[np.ndarray, "height width 3"]:

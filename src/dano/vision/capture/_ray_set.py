@@ -19,24 +19,17 @@ _CHUNK = 1 << 15
 
 
 class RaySet(NamedTuple):
-    """Rays with what photographs show of them, in float32.
+    """Rays with what photographs show of them, in float32."""
 
-    Attributes:
-        rays: Those that may meet the object.
-        colour: sRGB over black of the object alone, shape (rays, 3); where the mask is doubted, of the
-            photograph without the share of `backdrop` that the mask leaves.
-        mask: Share of the pixel that the object covers, shape (rays,).
-        doubt: How far that may be wrong, shape (rays,).
-        backdrop: What the pixel would show without the object, or white, shape (rays, 3).
-        view: Number of the view that each belongs to, shape (rays,).
-    """
-
-    rays: Rays
+    rays: Rays  # Those that may meet the object
+    # sRGB over black of the object alone, shape (rays, 3); where the mask is doubted, of the photograph
+    # without the share of `backdrop` that the mask leaves.
     colour: Float[Array, "rays 3"]
-    mask: Float[Array, " rays"]
-    doubt: Float[Array, " rays"]
+    mask: Float[Array, " rays"]  # Share of the pixel that the object covers, shape (rays,)
+    doubt: Float[Array, " rays"]  # How far that may be wrong, shape (rays,)
+    # What the pixel would show without the object, or white, shape (rays, 3).
     backdrop: Float[Array, "rays 3"]
-    view: Int[Array, " rays"]
+    view: Int[Array, " rays"]  # Number of the view that each belongs to, shape (rays,)
 
     def drawn(self, n: int, key: PRNGKeyArray) -> "RaySet":
         """`n` of them at random, with repetition."""

@@ -7,20 +7,13 @@ from jaxtyping import Array, Float
 
 
 class Rays(NamedTuple):
-    """Rays through the object, one a row, in float32.
+    """Rays through the object, one a row, in float32."""
 
-    Attributes:
-        origin: [m], shape (rays, 3).
-        direction: Unit vectors, shape (rays, 3).
-        near: Where the object may begin [m], shape (rays,).
-        far: Where it must have ended [m], shape (rays,).
-        light: Unit vectors towards the light, shape (rays, 3), or its position [m] if that is what is known.
-    """
-
-    origin: Float[Array, "rays 3"]
-    direction: Float[Array, "rays 3"]
-    near: Float[Array, " rays"]
-    far: Float[Array, " rays"]
+    origin: Float[Array, "rays 3"]  # [m], shape (rays, 3)
+    direction: Float[Array, "rays 3"]  # Unit vectors, shape (rays, 3)
+    near: Float[Array, " rays"]  # Where the object may begin [m], shape (rays,)
+    far: Float[Array, " rays"]  # Where it must have ended [m], shape (rays,)
+    # Unit vectors towards the light, shape (rays, 3), or its position [m] if that is what is known.
     light: Float[Array, "rays 3"]
 
     def at(self, t: Float[Array, "rays k"]) -> Float[Array, "n 3"]:

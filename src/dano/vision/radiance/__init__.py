@@ -1,7 +1,5 @@
 """What a photograph is explained by: radiance models, volume rendering, the field that is learned."""
 
-from dano.vision.radiance._files import model_of_file as model_of_file
-from dano.vision.radiance._hash_model import HashModel as HashModel
 from dano.vision.radiance._learned import Doubt as Doubt, LearnedField as LearnedField
 from dano.vision.radiance._models import (
     AbstractMedium as AbstractMedium,
@@ -19,7 +17,6 @@ from dano.vision.radiance._models import (
     SurfaceModel as SurfaceModel,
     Vectors as Vectors,
 )
-from dano.vision.radiance._osf import OSF as OSF
 from dano.vision.radiance._picture import (
     picture as picture,
     pixel_order as pixel_order,

@@ -17,20 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dano.fields import CallableField
 from dano.vision.capture import NodeGrid, Rays
-from dano.vision.radiance._volume import (
-    by_halves,
-    composite,
-    density_alpha,
-    importance_edges,
-    rows_at,
-    section_weights,
-    smooth_slope_at,
-    stratified_edges,
-    surface_alpha,
-    surface_interest,
-    value_and_slope_at,
-    value_at,
-)
+from dano.vision.radiance import _volume
 
 Share = float | Float[Array, ""]
 Vectors = Float[Array, "n 3"]
@@ -137,7 +124,7 @@ class Appearance(eqx.Module):
                 shape; 1 to use it.
         """
         u = ((points - self.origin[None]) / self.spacing).T
-        inputs = [rows_at(self.features, u), normal, view_share * view]
+        inputs = [_volume.rows_at(self.features, u), normal, view_share * view]
         if self.lit:
             if self.near_light:
                 towards = light - points
@@ -209,7 +196,7 @@ class AbstractModel(eqx.Module):
         Returns:
             How much of what is seen is decided in sections, and where along rays the least gets through.
         """
-        weights = section_weights(self.alpha(rays, edges, sharpness))
+        weights = _volume.section_weights(self.alpha(rays, edges, sharpness))
         return weights, 0.5 * (edges[:, :1] + edges[:, -1:])
 
     def attached(self, rays: Rays, edges: Edges, sharpness: Share) -> Edges:
@@ -228,7 +215,7 @@ class AbstractMedium(AbstractModel):
     def alpha(self, rays: Rays, edges: Edges, sharpness: Share) -> Sections:
         """See `density_alpha`, with the density in the middle of each section."""
         middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-        return density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
+        return _volume.density_alpha(self.density_at(rays.at(middle)).reshape(middle.shape), edges)
 
     def field(self) -> CallableField:
         """The density as a field, with gradients by automatic differentiation; bake it before simulating."""
@@ -244,7 +231,7 @@ class AbstractSurface(AbstractModel):
 
     def alpha(self, rays: Rays, edges: Edges, sharpness: Share) -> Sections:
         """See `surface_alpha`."""
-        return surface_alpha(self._along(rays, edges), jnp.asarray(sharpness))
+        return _volume.surface_alpha(self._along(rays, edges), jnp.asarray(sharpness))
 
     def scouted(self, rays: Rays, edges: Edges, sharpness: Share) -> tuple[Sections, Float[Array, "rays 1"]]:
         """See `surface_interest`; as blurred as sections are long, or the surface hides between two edges.
@@ -261,11 +248,11 @@ class AbstractSurface(AbstractModel):
         bend = jnp.maximum(before + after - 2 * here, 1e-9)
         shift = jnp.clip(0.5 * (before - after) / bend, -1, 1)
         closest = jnp.take_along_axis(edges, least, axis=1) + shift * (edges[:, 1:2] - edges[:, :1])
-        return surface_interest(distance, blurred), closest
+        return _volume.surface_interest(distance, blurred), closest
 
     def _along(self, rays: Rays, edges: Edges) -> Edges:
         """Signed distances [m] at distances along rays."""
-        return by_halves(lambda some, t: self.distance_at(some.at(t)).reshape(t.shape), rays, edges)
+        return _volume.by_halves(lambda some, t: self.distance_at(some.at(t)).reshape(t.shape), rays, edges)
 
     def attached(self, rays: Rays, edges: Edges, sharpness: Share) -> Edges:
         """See `AbstractModel.attached`: with where a ray meets the surface (implicit function theorem).
@@ -296,12 +283,12 @@ def sections(
 ) -> tuple[Edges, Sections]:
     """Edges of the fine sections, around what coarse ones found, and their opacity; arguments as of `see`."""
     keys = (None, None) if key is None else jax.random.split(key)
-    coarse = stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
+    coarse = _volume.stratified_edges(rays.near, rays.far, sampling.coarse, keys[0])
     count = sampling.fine - sampling.grazes
     # Where it is looked has no derivative: nothing is kept for one.
     scout, seen, where, steep = jax.lax.stop_gradient((model, rays, coarse, sharpness))
     weights, closest = scout.scouted(seen, where, steep)
-    edges = importance_edges(coarse, weights, count, keys[1])
+    edges = _volume.importance_edges(coarse, weights, count, keys[1])
     if sampling.grazes:
         edges = jnp.sort(jnp.concatenate([edges, closest], axis=1), axis=1)
     if sampling.moves:
@@ -329,7 +316,7 @@ def see(
         key: Random key for jitter of the sections; None for none.
     """
     edges, alpha = sections(model, rays, sharpness, sampling, key)
-    weights = section_weights(alpha)
+    weights = _volume.section_weights(alpha)
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     _, chosen = jax.lax.top_k(jax.lax.stop_gradient(weights), sampling.colours)
     some = jnp.take_along_axis(weights, chosen, axis=1)
@@ -341,10 +328,10 @@ def see(
     share = (opacity / jnp.maximum(jnp.sum(some, axis=1), 1e-6))[:, None]
     shape = (len(rays.near), sampling.colours, 3)
     return Seen(
-        colour=composite(some, colour.reshape(shape)) * share,
+        colour=_volume.composite(some, colour.reshape(shape)) * share,
         opacity=opacity,
         depth=jnp.sum(weights * middle, axis=1) / jnp.maximum(opacity, 1e-6),
-        normal=composite(some, normal.reshape(shape)) * share,
+        normal=_volume.composite(some, normal.reshape(shape)) * share,
     )
 
 
@@ -411,13 +398,13 @@ class SurfaceModel(_OnNodes, AbstractSurface):
 
     def distance_at(self, points: Vectors) -> Float[Array, " n"]:
         """Signed distances [m] at points [m]."""
-        return value_at(self.distance, self._index(points)) * self.scale
+        return _volume.value_at(self.distance, self._index(points)) * self.scale
 
     def colour(
         self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
     ) -> tuple[Vectors, Vectors]:
         """See `AbstractModel.colour`; normals are the gradient of the distance, continuous between cells."""
-        slope = smooth_slope_at(self.distance, self._index(points))
+        slope = _volume.smooth_slope_at(self.distance, self._index(points))
         normal = slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-12)[:, None]
         return self.appearance(points, normal, view, light, view_share), normal
 
@@ -453,7 +440,7 @@ class DensityModel(_OnNodes, AbstractMedium):
     def density_at(self, points: Vectors) -> Float[Array, " n"]:
         """Extinction [1/m] at points [m]."""
         u = self._index(points)
-        return jax.nn.softplus(value_at(self.raw, u)) / self.spacing
+        return jax.nn.softplus(_volume.value_at(self.raw, u)) / self.spacing
 
     def colour(
         self, points: Vectors, view: Vectors, light: Vectors, view_share: Share = 1.0
@@ -461,6 +448,6 @@ class DensityModel(_OnNodes, AbstractMedium):
         """See `AbstractModel.colour`; a medium's normals are against the gradient of its density."""
         u = self._index(points)
         # Not learned through: fog has normals in all directions, and explaining shading by them makes noise.
-        _, slope = value_and_slope_at(jax.lax.stop_gradient(self.raw), u)
+        _, slope = _volume.value_and_slope_at(jax.lax.stop_gradient(self.raw), u)
         normal = -slope.T * jax.lax.rsqrt(jnp.sum(slope * slope, axis=0) + 1e-6)[:, None]
         return self.appearance(points, normal, view, light, view_share), normal

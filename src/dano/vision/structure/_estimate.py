@@ -19,41 +19,12 @@ from dano.archive import checked_output, replacing
 from dano.checks import checked_items, checked_optional, checked_path, checked_progress
 from dano.progress import Progress
 from dano.vision.capture import PosedCamera
+from dano.vision.structure import _diagnosis, _gauge, _photographs
 from dano.vision.structure._colmap import colmap, opencv, quiet
-from dano.vision.structure._diagnosis import (
-    doubts,
-    motion_fault,
-    stands_still,
-    too_few,
-    why_left_out,
-    why_none,
-)
 from dano.vision.structure._features import enlargement, find_matches, Matches, where_points_count
-from dano.vision.structure._gauge import (
-    cameras_up,
-    length_scale,
-    marker_scale,
-    marker_up,
-    plane_up,
-    Scale,
-    UNKNOWN_SCALE,
-    UNKNOWN_UP,
-    Up,
-    world_frame,
-)
 from dano.vision.structure._mapping import find_models, Lens, SparseModel
 from dano.vision.structure._markers import detect_markers, place_markers, PlacedMarker
 from dano.vision.structure._options import FEWEST, PoseOptions
-from dano.vision.structure._photographs import (
-    is_video,
-    mask_folder,
-    Photograph,
-    picture_files,
-    read_photograph,
-    stretch,
-    without_what_stays,
-    write_frames,
-)
 from dano.vision.structure._similarity import Similarity
 
 _PLAIN = 6.0
@@ -86,8 +57,8 @@ class EstimatedPoses(NamedTuple):
     triangulation_angle: float  # Largest angle between two rays to a point, median over points [rad]
     n_points: int  # Number of points in space
     features_on: str  # Where points were looked for
-    scale: Scale  # Of the model, with its uncertainty
-    up: Up  # Where up is, in W if it is known (0, 0, 1), with its uncertainty
+    scale: _gauge.Scale  # Of the model, with its uncertainty
+    up: _gauge.Up  # Where up is, in W if it is known (0, 0, 1), with its uncertainty
     markers: tuple[PlacedMarker, ...]  # Printed markers that were found, in units of the model
     warnings: tuple[str, ...]  # What to know before using it
 
@@ -127,24 +98,24 @@ def estimate_poses(
     # What is missing is said before work starts.
     colmap()
     opencv()
-    between = stretch(options.since, options.until)
-    if not isinstance(images, (str, Path)) and len(images) == 1 and is_video(images[0]):
+    between = _photographs.stretch(options.since, options.until)
+    if not isinstance(images, (str, Path)) and len(images) == 1 and _photographs.is_video(images[0]):
         images = images[0]
-    if isinstance(images, (str, Path)) and is_video(Path(images)):
+    if isinstance(images, (str, Path)) and _photographs.is_video(Path(images)):
         if frames is None:
             raise ValueError("frames must be a folder for the frames of the video, got None")
-        files = write_frames(Path(images), Path(frames), options.frames, told, between=between)
+        files = _photographs.write_frames(Path(images), Path(frames), options.frames, told, between=between)
         try:
             return _from_files(files, options, masks, told, ordered=True)
         except BaseException:
             shutil.rmtree(frames, ignore_errors=True)
             raise
     if isinstance(images, (str, Path)):
-        return _from_files(picture_files(Path(images)), options, masks, told, ordered=False)
+        return _from_files(_photographs.picture_files(Path(images)), options, masks, told, ordered=False)
     videos = _videos(images, frames)
     try:
         files = _listed(images, videos, frames, options, between, told)
-        return _from_files(picture_files(files), options, masks, told, ordered=False)
+        return _from_files(_photographs.picture_files(files), options, masks, told, ordered=False)
     except BaseException:
         if videos and frames is not None:
             shutil.rmtree(frames, ignore_errors=True)
@@ -157,7 +128,7 @@ def _videos(images: Sequence[Path], frames: str | Path | None) -> list[Path]:
     Raises:
         ValueError: If it holds something, or two videos have one name.
     """
-    videos = [file for file in images if is_video(file)]
+    videos = [file for file in images if _photographs.is_video(file)]
     if not videos:
         return []
     if frames is None:
@@ -185,9 +156,11 @@ def _listed(
             Path(frames).mkdir(exist_ok=True)
             count = max(1, options.frames // len(videos))
             place = Path(frames) / file.stem
-            files += write_frames(file, place, count, told, prefix=f"{file.stem}_", between=between)
+            files += _photographs.write_frames(
+                file, place, count, told, prefix=f"{file.stem}_", between=between
+            )
         else:
-            files += picture_files(file) if file.is_dir() else [file]
+            files += _photographs.picture_files(file) if file.is_dir() else [file]
     return files
 
 
@@ -196,22 +169,22 @@ def _from_files(
 ) -> EstimatedPoses:
     photographs, left_out = _read(files, masks, told)
     if len(photographs) < FEWEST:
-        raise ValueError(too_few(len(photographs), left_out))
+        raise ValueError(_diagnosis.too_few(len(photographs), left_out))
     on = _features_on(photographs, options.features_on)
     counted = [where_points_count(photograph.mask, on) for photograph in photographs]
     with tempfile.TemporaryDirectory(prefix="dano-poses-") as folder, quiet():
         matches = find_matches(photographs, counted, options, Path(folder), ordered=ordered, progress=told)
-        if (still := stands_still(photographs, matches)) is not None:
+        if (still := _diagnosis.stands_still(photographs, matches)) is not None:
             # It hides what moves: few points of the object are among the strongest of a picture.
-            cleaned, again = without_what_stays(photographs, counted), Path(folder) / "again"
+            cleaned, again = _photographs.without_what_stays(photographs, counted), Path(folder) / "again"
             again.mkdir()
             matches = find_matches(cleaned, counted, options, again, ordered=ordered, progress=told)
-        if fault := motion_fault(photographs, matches, options, still=still):
+        if fault := _diagnosis.motion_fault(photographs, matches, options, still=still):
             raise ValueError(f"no cameras: {fault}")
         scales = [enlargement(photograph) for photograph in photographs]
         models = find_models(matches, scales, options, Path(folder), told)
     if not models or len(models[0].pictures) < FEWEST:
-        raise ValueError(f"no cameras: {why_none(photographs, matches)}")
+        raise ValueError(f"no cameras: {_diagnosis.why_none(photographs, matches)}")
     if options.model > len(models):
         raise ValueError(f"model must be at most {len(models)}, the number of models, got {options.model}")
     return _result(photographs, left_out, matches, models, options, on, told)
@@ -219,19 +192,19 @@ def _from_files(
 
 def _read(
     files: list[Path], masks: str | Path | None, told: Progress
-) -> tuple[list[Photograph], list[tuple[str, str]]]:
+) -> tuple[list[_photographs.Photograph], list[tuple[str, str]]]:
     photographs, left_out = [], []
-    folder = mask_folder(files[0], None if masks is None else Path(masks)) if files else None
+    folder = _photographs.mask_folder(files[0], None if masks is None else Path(masks)) if files else None
     for i, file in enumerate(files):
         told("reading pictures", i / len(files))
         try:
-            photographs.append(read_photograph(file, folder))
+            photographs.append(_photographs.read_photograph(file, folder))
         except ValueError as error:
             left_out.append((file.name, str(error)))
     return photographs, left_out
 
 
-def _features_on(photographs: Sequence[Photograph], asked: str) -> str:
+def _features_on(photographs: Sequence[_photographs.Photograph], asked: str) -> str:
     """Where to look for points: see `PoseOptions.features_on`.
 
     Raises:
@@ -259,7 +232,7 @@ def _features_on(photographs: Sequence[Photograph], asked: str) -> str:
     return "object" if alike and np.median(alike) > _STANDS_STILL else "surroundings"
 
 
-def _surroundings(photograph: Photograph) -> tuple[np.ndarray, np.ndarray]:
+def _surroundings(photograph: _photographs.Photograph) -> tuple[np.ndarray, np.ndarray]:
     """A picture without its slow changes of brightness, reduced; and where it does not show the object."""
     step = max(1, max(photograph.size) // 160)
     grey = photograph.grey[::step, ::step].astype(np.float64)
@@ -287,7 +260,7 @@ def _posed(lens: Lens, world_to_camera: np.ndarray, size: tuple[int, int]) -> Po
 
 
 def _result(
-    photographs: list[Photograph],
+    photographs: list[_photographs.Photograph],
     left_out: list[tuple[str, str]],
     matches: Matches,
     models: list[SparseModel],
@@ -303,16 +276,16 @@ def _result(
         for lens, pose, photograph in zip(model.lenses, model.cameras, shown, strict=True)
     ]
     markers = _markers(shown, cameras, options, told)
-    warnings = doubts(photographs, models, chosen, options)
+    warnings = _diagnosis.doubts(photographs, models, chosen, options)
     scale = _scale(shown, cameras, markers, options, warnings)
     up = _up(shown, cameras, markers, model, options, warnings)
-    frame = world_frame(cameras, scale, up, markers)
+    frame = _gauge.world_frame(cameras, scale, up, markers)
     return EstimatedPoses(
         pictures=_pictures(shown, cameras, model, frame),
         left_out=tuple(
             left_out
             + [
-                (photograph.name, why_left_out(i, photographs, matches, models, chosen))
+                (photograph.name, _diagnosis.why_left_out(i, photographs, matches, models, chosen))
                 for i, photograph in enumerate(photographs)
                 if i not in model.pictures
             ]
@@ -332,7 +305,7 @@ def _result(
 
 
 def _pictures(
-    shown: list[Photograph], cameras: list[PosedCamera], model: SparseModel, frame: Similarity
+    shown: list[_photographs.Photograph], cameras: list[PosedCamera], model: SparseModel, frame: Similarity
 ) -> tuple[PosedPicture, ...]:
     pictures = []
     for i, (photograph, camera) in enumerate(zip(shown, cameras, strict=True)):
@@ -352,7 +325,7 @@ def _pictures(
 
 
 def _markers(
-    shown: list[Photograph], cameras: list[PosedCamera], options: PoseOptions, told: Progress
+    shown: list[_photographs.Photograph], cameras: list[PosedCamera], options: PoseOptions, told: Progress
 ) -> list[PlacedMarker]:
     if options.marker_size is None:
         return []
@@ -364,17 +337,17 @@ def _markers(
 
 
 def _scale(
-    shown: list[Photograph],
+    shown: list[_photographs.Photograph],
     cameras: list[PosedCamera],
     markers: list[PlacedMarker],
     options: PoseOptions,
     warnings: list[str],
-) -> Scale:
+) -> _gauge.Scale:
     """The most exact of the answers, compared with the other."""
     answers = []
     if options.marker_size is not None:
         if markers:
-            answers.append(marker_scale(markers, options.marker_size))
+            answers.append(_gauge.marker_scale(markers, options.marker_size))
         else:
             warnings.append(
                 f"no marker of {options.marker_family} is seen in three pictures: is the family right, has"
@@ -383,10 +356,10 @@ def _scale(
             )
     if options.known_length is not None:
         named = {p.name: camera for p, camera in zip(shown, cameras, strict=True)}
-        answers.append(length_scale(options.known_length, named))
+        answers.append(_gauge.length_scale(options.known_length, named))
     if not answers:
         warnings.append("the scale is not known, lengths are in units of the cameras' mean distance")
-        return UNKNOWN_SCALE
+        return _gauge.UNKNOWN_SCALE
     best, *others = sorted(answers, key=lambda answer: answer.error)
     for other in others:
         assert best.metres is not None and other.metres is not None
@@ -399,32 +372,32 @@ def _scale(
 
 
 def _up(
-    shown: list[Photograph],
+    shown: list[_photographs.Photograph],
     cameras: list[PosedCamera],
     markers: list[PlacedMarker],
     model: SparseModel,
     options: PoseOptions,
     warnings: list[str],
-) -> Up:
+) -> _gauge.Up:
     """The first that can be had of those asked for."""
     if options.up == "none":
-        return UNKNOWN_UP
+        return _gauge.UNKNOWN_UP
     if options.up in ("auto", "marker"):
-        if up := marker_up(markers, cameras):
+        if up := _gauge.marker_up(markers, cameras):
             return up
         if options.up == "marker":
             raise ValueError("up='marker', but no marker is seen lying flat in three pictures")
     if options.up in ("auto", "plane"):
-        if up := plane_up(_around_object(shown, model), cameras, options.seed):
+        if up := _gauge.plane_up(_around_object(shown, model), cameras, options.seed):
             return up
         if options.up == "plane":
             raise ValueError("up='plane', but no plane below the cameras holds a quarter of the points")
-    up = cameras_up(cameras)
+    up = _gauge.cameras_up(cameras)
     warnings.append(f"up is only taken from how the cameras were held, to {math.degrees(up.error):.1f}°")
     return up
 
 
-def _around_object(shown: list[Photograph], model: SparseModel) -> np.ndarray:
+def _around_object(shown: list[_photographs.Photograph], model: SparseModel) -> np.ndarray:
     """Points that most pictures show beside the object; all where there are no masks."""
     inside, count = np.zeros(len(model.points)), np.zeros(len(model.points))
     for i, photograph in enumerate(shown):

@@ -10,19 +10,12 @@ from dano.vision.training._metrics import mask_iou, psnr, ssim
 
 
 class Score(NamedTuple):
-    """How well views are rendered, means over them.
+    """How well views are rendered, means over them."""
 
-    Attributes:
-        psnr: Of whole images, on the photographs' own background or on white [dB].
-        psnr_object: Of the pixels that show the object [dB].
-        ssim: Structural similarity of whole images.
-        mask_iou: Intersection over union of the silhouettes.
-    """
-
-    psnr: float
-    psnr_object: float
-    ssim: float
-    mask_iou: float
+    psnr: float  # Of whole images, on the photographs' own background or on white [dB]
+    psnr_object: float  # Of the pixels that show the object [dB]
+    ssim: float  # Structural similarity of whole images
+    mask_iou: float  # Intersection over union of the silhouettes
 
 
 def score(field: LearnedField, views: tuple[View, ...]) -> Score:

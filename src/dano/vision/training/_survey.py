@@ -29,24 +29,16 @@ Corners = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 
 class Survey(NamedTuple):
-    """What the silhouettes tell before training.
+    """What the silhouettes tell before training."""
 
-    Attributes:
-        box: Nodes around the object.
-        hull: Signed distance [m] of the visual hull at these nodes.
-        residual: 1 − mean intersection over union of the hull's silhouettes and the masks: near 0 if poses,
-            focal lengths and masks fit together.
-        gap: Angle [rad] between the camera direction that is missing most and the nearest one there is.
-        gap_direction: That direction, from the object outwards [W], shape (3,).
-        warnings: Sentences for the user.
-    """
-
-    box: NodeGrid
-    hull: Float[np.ndarray, "nx ny nz"]
+    box: NodeGrid  # Nodes around the object
+    hull: Float[np.ndarray, "nx ny nz"]  # Signed distance [m] of the visual hull at these nodes
+    # 1 − mean intersection over union of the hull's silhouettes and the masks: near 0 if poses, focal lengths
+    # and masks fit together.
     residual: float
-    gap: float
-    gap_direction: Float[np.ndarray, "3"]
-    warnings: tuple[str, ...]
+    gap: float  # Angle [rad] between the camera direction that is missing most and the nearest one there is
+    gap_direction: Float[np.ndarray, "3"]  # That direction, from the object outwards [W], shape (3,)
+    warnings: tuple[str, ...]  # Sentences for the user
 
 
 def visual_hull(

@@ -78,57 +78,36 @@ Stopped = Literal["finished", "converged", "geometry", "time", "diverged"]
 
 
 class HistoryEntry(NamedTuple):
-    """What held-out views tell during training.
+    """What held-out views tell during training."""
 
-    Attributes:
-        iteration: Steps done.
-        iterations: Steps to do at most.
-        seconds: Time in steps so far, without compilation [s].
-        rays_per_second: Of the last steps.
-        loss: Of the last step.
-        psnr: Of held-out views [dB].
-        mask_iou: Of held-out views.
-        volume: Of the solid [m³].
-    """
-
-    iteration: int
-    iterations: int
-    seconds: float
-    rays_per_second: float
-    loss: float
-    psnr: float
-    mask_iou: float
-    volume: float
+    iteration: int  # Steps done
+    iterations: int  # Steps to do at most
+    seconds: float  # Time in steps so far, without compilation [s]
+    rays_per_second: float  # Of the last steps
+    loss: float  # Of the last step
+    psnr: float  # Of held-out views [dB]
+    mask_iou: float  # Of held-out views
+    volume: float  # Of the solid [m³]
 
 
 class Trained(NamedTuple):
-    """What comes out of training.
+    """What comes out of training."""
 
-    Attributes:
-        field: The field.
-        capture: The photographs as they were compared: at the resolution that was worked with, seen by
-            corrected cameras.
-        survey: What the silhouettes told, with the visual hull.
-        scores: By split: "test", "relight", or "train" (some of its views) if nothing was held out.
-        history: One entry per evaluation on held-out views.
-        stopped: Why training ended.
-        seconds: From the start, with compilation and final measurements [s].
-        unseen: Share of the surface that fewer than two training views see.
-        unexplained: Share of the silhouettes that the field does not explain: of what is not in both its
-            silhouettes and the masks, or where colours decide, of pixels that show another colour.
-        warnings: Sentences for the user.
-    """
-
-    field: LearnedField
+    field: LearnedField  # The field
+    # The photographs as they were compared: at the resolution that was worked with, seen by corrected
+    # cameras.
     capture: Capture
-    survey: Survey
+    survey: Survey  # What the silhouettes told, with the visual hull
+    # By split: "test", "relight", or "train" (some of its views) if nothing was held out.
     scores: dict[str, Score]
-    history: tuple[HistoryEntry, ...]
-    stopped: Stopped
-    seconds: float
-    unseen: float
+    history: tuple[HistoryEntry, ...]  # One entry per evaluation on held-out views
+    stopped: Stopped  # Why training ended
+    seconds: float  # From the start, with compilation and final measurements [s]
+    unseen: float  # Share of the surface that fewer than two training views see
+    # Share of the silhouettes that the field does not explain: of what is not in both its silhouettes and the
+    # masks, or where colours decide, of pixels that show another colour.
     unexplained: float
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  # Sentences for the user
 
 
 class _State(eqx.Module):
@@ -149,6 +128,7 @@ def train(
     options: TrainOptions | None = None,
     *,
     table: float | None = None,
+    views: int | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
@@ -161,6 +141,7 @@ def train(
         options: How; default `TrainOptions()`.
         table: Height z of a level table [m, W] that the object stands on: masks that are doubted (those that
             `with_masks` found on a table) are only a beginning, and colours of object and table decide.
+        views: Train on so many of the views only.
         checkpoint: File that the state is written to at each evaluation, and when interrupted.
         resume: Go on from `checkpoint` if it exists.
         progress: Called after every few steps, while cavities are looked for and during training.
@@ -178,6 +159,8 @@ def train(
     start = time.perf_counter()
     options = TrainOptions() if options is None else options
     folder = None if previews is None else checked_folder(previews)
+    if views is not None:
+        capture = capture.thinned(views)
     near = {view.light_is_near for view in capture.views if view.light is not None}
     if len(near) > 1:
         raise ValueError("lights must be given as directions or as positions, got some of each")
