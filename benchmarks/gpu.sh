@@ -22,7 +22,7 @@ trap 'rm -rf "$made"' EXIT
 cache=${CACHE:-$made}
 export DANO_CACHE_DIR=$cache
 begin=$SECONDS
-for name in bunny bunny32 boxes panda; do
+for name in bunny bunny32 boxes panda bowl strikes; do
   XLA_PYTHON_CLIENT_PREALLOCATE=false "$python" -m benchmarks.gpu --compile "$name" --json "$made/$name.json" > "$made/$name.log" 2>&1 &
 done
 wait

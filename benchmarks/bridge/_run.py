@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks._measure import load_average, parse_arguments, parts_option, report, Row, rows_of_parts
 from benchmarks.bridge._agreement import agreement_row, HOLLOW, hollow, HOLLOW_NODES, with_article
+from benchmarks.bridge._bars import bar_rows
 from benchmarks.bridge._grip import finger_rows
 from benchmarks.bridge._hold import hold_rows
 from benchmarks.bridge._probes import probe_rows
@@ -168,6 +169,7 @@ def _resident() -> int:
 PARTS = {
     "rest": _all_rest_rows,
     "agreement": _agreement_rows,
+    "bars": bar_rows,
     "fingers": finger_rows,
     "hold": hold_rows,
     "probes": probe_rows,

@@ -14,11 +14,14 @@ import numpy as np
 import dano
 from benchmarks._subjects import shipped_bunny
 from benchmarks.robots.push._case import BEHIND, BUNNY, DOWN, HEIGHT, RADIUS, READY
+from benchmarks.speed._arms import panda, strikes
 from benchmarks.speed._crowds import crowds
 from benchmarks.speed._dano import FRICTION, sliding
 
 # Chunks of points that a world has room for: more than ever touch in these scenes.
-_BUNNY_ROOM, _BOXES_ROOM = 16, 32
+_BUNNY_ROOM, _BOXES_ROOM, _BOWL_ROOM = 16, 32, 64
+# Of the bowl: radius, half of its wall, and the cell of its grid [m].
+_BOWL, _WALL, _CELL = 0.2, 0.01, 0.008
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class Case:
         narrow: Whether numbers have 32 bits.
         backward: Whether reverse mode is timed, too.
         room: Chunks of points.
+        control: What motors are told in all steps, None for nothing.
     """
 
     name: str
@@ -42,6 +46,7 @@ class Case:
     narrow: bool = False
     backward: bool = False
     room: int = _BUNNY_ROOM
+    control: dano.Control | None = None
 
     def begun(self, leaves: Sequence[np.ndarray]) -> "Case":
         """The same rollouts from the numbers of a state that another machine found."""
@@ -60,6 +65,9 @@ class Case:
     def program(self, n_steps: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
         """Positions at the ends of all steps, and which steps were solved, of all worlds."""
         static = eqx.filter(self.scene, eqx.is_array, inverse=True)
+        controls = jax.tree.map(lambda x: x[None].repeat(n_steps, axis=0), self.control)
+        if self.narrow:
+            controls = jax.tree.map(lambda x: x.astype(jnp.float32), controls)
 
         def rolled(arrays: dano.Scene, state: dano.State, shaken: jax.Array) -> tuple[jax.Array, jax.Array]:
             scene = eqx.combine(arrays, static)
@@ -68,7 +76,7 @@ class Case:
 
             def one(first: jax.Array) -> tuple[jax.Array, jax.Array]:
                 begun = eqx.tree_at(lambda s: s.velocity, state, state.velocity.at[0].set(first))
-                found = engine.rollout(scene, prepared, scene.filled(begun), None, n_steps)
+                found = engine.rollout(scene, prepared, scene.filled(begun), controls, n_steps)
                 assert found is not None
                 states, report = found
                 return states.position, report.converged
@@ -94,6 +102,8 @@ def cases() -> dict[str, Callable[[], Case]]:
         "bunny32": lambda: _bunny("bunny slides, float32", narrow=True),
         "boxes": _boxes,
         "panda": _panda,
+        "bowl": _bowl,
+        "strikes": _strikes,
     }
 
 
@@ -150,3 +160,40 @@ def _panda() -> Case:
     moving = found.state.v.at[3].set(0.5)
     state = eqx.tree_at(lambda s: s.v, found.state, moving)
     return Case("Panda pushes the bunny", scene, state, 4096, room=_BUNNY_ROOM)
+
+
+def _bowl() -> Case:
+    """Four bunnies fall into the lower half of a hollow ball."""
+    n = round(2 * (_BOWL + 4 * _WALL) / _CELL) + 1
+    axis = _CELL * (np.arange(n) - (n - 1) / 2)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    distances = np.maximum(np.abs(np.sqrt(x * x + y * y + z * z) - _BOWL) - _WALL, z)
+    grid = dano.fields.SignedDistanceGrid(distances, (axis[0],) * 3, _CELL)
+    bowl = dano.NeuralObject.from_field(grid, mass=1.0)
+    bunny = shipped_bunny().bunny
+    names = [f"bunny {i}" for i in range(4)]
+    scene = dano.Scene.create(
+        [*(dano.Body(name, bunny) for name in names), dano.Body("bowl", bowl, fixed=True)],
+        others=dano.ContactParams(sliding_friction=FRICTION),
+        timestep=0.005,
+    )
+    starts: dict[str, dict[str, Any]] = {
+        name: {
+            "position": (0.07 * (1 - 2 * (i % 2)), 0.07 * (1 - 2 * (i // 2)), 0.0),
+            "velocity": (0, 0, -0.5),
+        }
+        for i, name in enumerate(names)
+    }
+    com = np.asarray(bowl.mass.com)
+    state = scene.initial_state(**starts, bowl={"position": com})
+    return Case("four bunnies in a bowl", scene, state, 1024, room=_BOWL_ROOM)
+
+
+def _strikes() -> Case:
+    """The arm of `benchmarks.speed`, whose motors turn it until it strikes a box, which slides a little."""
+    if panda() is None:
+        raise FileNotFoundError("the Panda is not there: pip install frax")
+    arm = strikes()
+    sliding_box = arm.state.velocity.at[arm.scene.index("box")].set(jnp.array([0.01, 0.0, 0.0]))
+    state = eqx.tree_at(lambda s: s.velocity, arm.state, sliding_box)
+    return Case(arm.name, arm.scene, state, 4096, control=arm.control)

@@ -1,4 +1,4 @@
-"""A robot of each family on a floor, held by servos, with its own collision meshes; beside MuJoCo."""
+"""Robots of five families on a floor, held by servos, with their own collision meshes; beside MuJoCo."""
 
 import dataclasses
 import importlib.util
@@ -25,6 +25,8 @@ _FAST = 50.0
 """Stiffness over damping of the servos [1/s]."""
 _ABOVE = 1e-3
 """Height from which robots that float are set down [m]."""
+_LIGHT = 1e-6
+"""Mass of links that are only there to have a name [kg]."""
 _EXAMPLES = "cmeel.prefix/share/example-robot-data/robots"
 _LEGS = ("FL", "FR", "RL", "RR")
 
@@ -48,6 +50,13 @@ _CASES = (
         "a1/a1.urdf",
         True,
         {f"{leg}_{part}_joint": q for leg in _LEGS for part, q in (("upper", 0.8), ("lower", -1.6))},
+    ),
+    _Case(
+        "quadruped (Go1)",
+        "cmeel",
+        "go1_description/urdf/go1.urdf",
+        True,
+        {f"{leg}_{part}_joint": q for leg in _LEGS for part, q in (("thigh", 0.8), ("calf", -1.6))},
     ),
     _Case("humanoid (G1)", "cmeel", "g1_description/urdf/g1_29dof_rev_1_0.urdf", True, {}),
     _Case("mobile base (Husky)", "pybullet_data", "husky/husky.urdf", True, {}),
@@ -184,6 +193,10 @@ def _in_mujoco(
         spec = mujoco.MjSpec.from_file(str(path))
     # Some moments exceed the sum of the others by a rounding of the file.
     spec.compiler.balanceinertia = True
+    # The root of Go1, of 1 mg, has moments that no body can have, which MuJoCo refuses.
+    for body in spec.bodies[1:]:
+        if body.mass <= _LIGHT:
+            body.fullinertia = [1e-3 * _LIGHT] * 3 + [0.0] * 3
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [1, 1, 1], "contype": 2, "conaffinity": 1}

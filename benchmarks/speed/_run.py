@@ -8,12 +8,15 @@ from collections.abc import Callable
 
 from benchmarks import _subjects
 from benchmarks._measure import load_average, NO_DATA, parse_arguments, report, Row, skipped, warm_up
-from benchmarks.speed import _crowds, _dano, _learning, _mujoco, _mujoco_crowds
+from benchmarks.speed import _arms, _crowds, _dano, _learning, _mujoco, _mujoco_crowds
 from benchmarks.speed._cases import Case, measure
 
 REPEATS, QUICK_REPEATS = 21, 3
 LARGEST = 64
+NO_ARM = "the package frax, which ships the Panda, is not installed"
 NO_MUJOCO = "not installed: pip install 'dano[mujoco]'"
+OF_BUNNIES = {"floor", "floor-distributed", "pressed", "gradients", "batch"}
+"""Parts that measure the authors' bunny, too, where it is there."""
 
 
 def run() -> None:
@@ -55,6 +58,8 @@ def _parts() -> dict[str, Callable[[list[_subjects.Subject]], list[Case]]]:
         parts[_key(crowd)] = lambda _, crowd=crowd: [_crowds.crowd_case(crowd)]
     for crowd in _crowds.piles():
         parts[_key(crowd)] = lambda _, crowd=crowd: [_crowds.pile_case(crowd)]
+    for part in _arms.ARMS:
+        parts[part] = lambda _, part=part: [_arms.arm_case(_arms.arm_of(part))]
     return {**parts, "learning": lambda _: _learning.learning_cases(_learning.bunny_photographs())}
 
 
@@ -71,6 +76,8 @@ def _mujoco_parts() -> dict[str, Callable[[], list[Case]]]:
     }
     for crowd in (*_crowds.crowds(), *_crowds.piles()):
         parts[_key(crowd)] = lambda crowd=crowd: [_mujoco_crowds.mujoco_crowd_case(crowd)]
+    for part in _arms.ARMS:
+        parts[part] = lambda part=part: [_arms.mujoco_arm_case(_arms.arm_of(part))]
     return parts
 
 
@@ -93,6 +100,11 @@ def _chosen(arguments: argparse.Namespace, missing: list[Row]) -> list[str]:
             names.remove(_key(crowd))
             reason = f"more than --largest {arguments.largest} bodies"
             missing.append(skipped(crowd.group, crowd.name, reason))
+    if _arms.panda() is None and _arms.ARMS.keys() & names:
+        names = [name for name in names if name not in _arms.ARMS]
+        missing.append(
+            skipped("An arm", "all of it", "the package frax, which ships the Panda, is not installed")
+        )
     return names
 
 
@@ -100,11 +112,12 @@ def _rows(repeats: int, arguments: argparse.Namespace) -> list[Row]:
     missing: list[Row] = []
     names = _chosen(arguments, missing)
     subjects = [_subjects.shipped_bunny()]
-    authors = None if arguments.quick else _subjects.authors_bunny()
-    if authors is not None:
-        subjects.append(authors)
-    elif not arguments.quick:
-        missing.append(skipped(_dano.FLOOR, "authors' bunny", NO_DATA))
+    if not arguments.quick and OF_BUNNIES.intersection(names):
+        authors = _subjects.authors_bunny()
+        if authors is None:
+            missing.append(skipped(_dano.FLOOR, "authors' bunny", NO_DATA))
+        else:
+            subjects.append(authors)
     cases: list[Case] = []
     for name in names:
         began = time.monotonic()

@@ -127,7 +127,7 @@ def _arrays(
     like: Parameters, parts: Sequence[Part], pairs: Int[np.ndarray, "k 2"], sizes: Float[np.ndarray, "g 3"]
 ) -> dict[str, np.ndarray]:
     """Arrays of `dano.mujoco.kernels.tables.Known` by place."""
-    sampled = [part.surface for part in parts if part.surface is not None]
+    sampled = [each for part in parts for each in _surfaces(part)]
     planes = [part.solid.planes for part in parts if part.solid.planes is not None]
     solids, at = _solids(like, parts)
     numbers, index = _parts(like, parts, at)
@@ -141,7 +141,7 @@ def _arrays(
         counts = [len(face.edges) for face in faces]
         flat["plane"], flat["count"] = np.array([face.plane for face in faces]), counts
         flat["first"] = np.cumsum([0, *counts[:-1]])
-    on_faces = [_on_faces(part) for part in parts if part.surface is not None]
+    on_faces = [_on_faces(part, each) for part in parts for each in _surfaces(part)]
     touching = like.rows("known.pairs", len(pairs))
     touching["first"], touching["second"] = pairs.T
     touching["both"] = [not _is_flat(parts[a], parts[b]) for a, b in pairs]
@@ -162,13 +162,17 @@ def _arrays(
     return {**{f"known.{name}": values for name, values in found.items()}, **solids}
 
 
-def _on_faces(part: Part) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+def _surfaces(part: Part) -> list[Surface]:
+    """The samples of a part, then a polyhedron's corners."""
+    corners = None if part.thing is None else part.thing.corners
+    return [each for each in (part.surface, corners) if each is not None]
+
+
+def _on_faces(part: Part, surface: Surface) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Normals of the faces that samples lie within, and which lie on edges: see `Faces.around`."""
-    assert part.surface is not None
-    n = len(part.surface.points)
     if part.thing is None:
-        return np.zeros((n, 3)), np.zeros(n, bool)
-    return part.thing.faces.around(part.surface.points, part.surface.vectors)
+        return np.zeros((len(surface.points), 3)), np.zeros(len(surface.points), bool)
+    return part.thing.faces.around(surface.points, surface.vectors)
 
 
 def _grain(part: Part) -> float:
@@ -243,22 +247,27 @@ def _parts(like: Parameters, parts: Sequence[Part], at: Sequence[int]):
     block, run, face = 0, 0, 0
     for row, whole, part, place in zip(numbers, index, parts, at, strict=True):
         thing = part.thing
-        row["scale"], row["thickness"] = part.scale, part.solid.thickness
+        row["scale"], row["thickness"], row["half"] = part.scale, part.solid.thickness, part.solid.half
         whole["first_face"], whole["faces"], row["grain"] = face, 0, _grain(part)
         whole["body"], whole["geom"], whole["is_object"] = part.body, part.geom, thing is not None
         whole["solid"], whole["at"] = _number(part.solid.kind), place
         whole["count"] = 0 if part.solid.planes is None else len(part.solid.planes)
         if thing is not None:
             row["middle"], row["radius"], row["thickness"] = thing.middle, thing.radius, thing.thickness
+            row["half"] = thing.half
+            if thing.corners is not None:
+                corners = np.count_nonzero(thing.corners.vectors.any(axis=1))
+                row["corner_share"] = len(thing.obj.surface.points) / corners
             whole["contype"], whole["conaffinity"] = thing.bits
             row["band"], row["slack"] = thing.faces.band(thing.thickness), thing.faces.slack
             whole["faces"] = len(thing.faces.faces)
             face += len(thing.faces.faces)
-        whole["first_block"], whole["blocks"] = block, _count(part) // _BLOCK
         whole["turning"] = 0 if part.surface is None else part.surface.turning
-        whole["first_run"] = run
-        block += _count(part) // _BLOCK
-        run += 0 if part.surface is None else len(part.surface.runs)
+        for surface, kind in zip(_surfaces(part), ("", "corner_"), strict=False):
+            whole[f"first_{kind}block"], whole[f"{kind}blocks"] = block, len(surface.balls)
+            whole[f"first_{kind}run"] = run
+            block += len(surface.balls)
+            run += len(surface.runs)
     return numbers, index
 
 
@@ -280,6 +289,7 @@ class NearSearch:
             "touches": self.touches,
             "scores": np.zeros(most + 1),
             "heads": np.zeros(most, np.int32),
+            "groups": parameters.rows("work.groups", -(-most // 8)),
             "rows": self.rows,
             "index": self.wholes,
             "found": self.found,

@@ -104,6 +104,7 @@ class Worlds:
         rooms.touches = wp.empty((searches, max(known.room, 1)), dtype=tables.Touch, device=device)
         rooms.scores = wp.empty((searches, most + 1), dtype=tables.real, device=device)
         rooms.heads = wp.empty((searches, most), dtype=whole, device=device)
+        rooms.groups = wp.empty((searches, -(-most // 8)), dtype=tables.Heads, device=device)
         rooms.rows = wp.empty((searches, most), dtype=tables.ContactRow, device=device)
         rooms.index = wp.empty((searches, most), dtype=tables.ContactIndex, device=device)
         contacts = kernels.Contacts()

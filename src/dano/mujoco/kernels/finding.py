@@ -27,7 +27,6 @@ from dano.physics.samples import facing_area, position_in_solid, solid_normal
 from dano.physics.solids.distances import solid_of
 from dano.physics.solids.grids import STEEPEST
 from dano.physics.solids.kinds import BOX, GRID, HALF_SPACE
-from dano.physics.solids.leaves import Distance
 
 _BLOCK, _GRID, _HALF_SPACE = wp.constant(BLOCK), wp.constant(GRID), wp.constant(HALF_SPACE)
 _RUN, _UNKNOWN = wp.constant(RUN), wp.constant(UNKNOWN)
@@ -231,13 +230,13 @@ def meeting(known: wp.ref[Known], model: wp.ref[Model], side: Side, sink: real, 
             if block < end:
                 for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
                     x = position_in_solid(pose, known.samples[s].point)
-                    d, flat = distance_with_faces(known, model, side.other, side.band, x)
-                    if d.value <= reach:
+                    value, gradient, flat = distance_with_faces(known, model, side.other, side.band, x)
+                    if value <= reach:
                         normal, flat = pressed_normal(
-                            pose, side.other.solid, known.facing[s], solid_normal(d.gradient), flat
+                            pose, side.other.solid, known.facing[s], solid_normal(gradient), flat
                         )
                         near = h * approach(pose, side.index.turning, x, normal)
-                        left = d.value + sink
+                        left = value + sink
                         # What begins deeper is no matter of this step.
                         if near > ZERO and (share > ZERO or left > ZERO):
                             if facing_area(pose, known.samples[s], normal) > ZERO:
@@ -253,24 +252,46 @@ def meeting(known: wp.ref[Known], model: wp.ref[Model], side: Side, sink: real, 
     return share
 
 
-@wp.func(inline=True)
-def side_touch(
-    side: Side, pose: PairPose, share: real, h: real, x: vec3, normal: vec3, distance: real
-) -> Touch:
-    """A sample at x of the solid's frame after a share of the step, as both bodies see it at the start."""
-    touch = Touch()
-    before = rotation_after(side.b, ZERO)
-    origin = side.b.position - before * side.b.com
-    below = origin + before * (x - distance * normal)
-    above = origin + before * x
+@wp.struct
+class AtStart:
+    """Where points of the solid's frame after a share of the step are when it begins [m, W].
+
+    Attributes:
+        turn: Of the solid's body.
+        origin: Of its frame.
+        samples_turn: Of the samples' body, for the same point of that.
+        samples_origin: The same.
+    """
+
+    turn: mat33
+    origin: vec3
+    samples_turn: mat33
+    samples_origin: vec3
+
+
+@wp.func
+def at_start(side: Side, share: real, h: real) -> AtStart:
+    """Both bodies at the start of the step, as seen after a share of it."""
+    found = AtStart()
+    found.turn = rotation_after(side.b, ZERO)
+    found.origin = side.b.position - found.turn * side.b.com
+    found.samples_turn = found.turn
+    found.samples_origin = found.origin
     if share > ZERO:
-        # The same point of the samples' body, where that is at the start.
-        after = side.b.position + (share * h) * side.b.velocity
-        place = after + rotation_after(side.b, share) * (x - side.b.com)
-        arm = place - side.a.position - (share * h) * side.a.velocity
-        still = wp.transpose(rotation_after(side.a, share)) * arm
-        above = side.a.position + rotation_after(side.a, ZERO) * still
-    n = before * normal
+        back = rotation_after(side.a, ZERO) * wp.transpose(rotation_after(side.a, share))
+        found.samples_turn = back * rotation_after(side.b, share)
+        apart = side.b.position - side.a.position + (share * h) * (side.b.velocity - side.a.velocity)
+        found.samples_origin = side.a.position + back * apart - found.samples_turn * side.b.com
+    return found
+
+
+@wp.func(inline=True)
+def side_touch(side: Side, pose: PairPose, start: AtStart, x: vec3, normal: vec3, distance: real) -> Touch:
+    """A sample at x of the solid's frame, as both bodies see it at the start of the step."""
+    touch = Touch()
+    below = start.origin + start.turn * (x - distance * normal)
+    above = start.samples_origin + start.samples_turn * x
+    n = start.turn * normal
     touch.position = HALF * (above + below)
     touch.gap = wp.dot(n, above - below)
     touch.normal = side.sign * n
@@ -301,6 +322,7 @@ def list_side(
             share = ZERO
             fast = False
     pose = side_pose(known, side, share, h)
+    start = at_start(side, share, h)
     stretch = stretch_of(side)
     reach = margin
     if fast:
@@ -320,19 +342,26 @@ def list_side(
                 sample = known.samples[s]
                 x = points * sample.point + origin
                 # Most samples of a near block are not near.
-                d = Distance()
+                value = real(-INFINITY)
+                gradient = vec3()
                 flat = int(0)
                 if side.other.solid == _GRID:
-                    d.value = seen - STEEPEST * wp.length(x - seen_at)
-                if d.value <= reach + side.slack:
-                    d.value = quick_clearance(known, side.other, x)
-                if d.value <= reach + side.slack:
-                    d, flat = distance_with_faces(known, model, side.other, side.band, x)
-                    seen = d.value
+                    value = seen - STEEPEST * wp.length(x - seen_at)
+                if value <= reach + side.slack:
+                    # Beside what is near, most are: their values are not asked without gradients. Nor are
+                    # those beside flat faces, where they are less exact than planes.
+                    enough = real(-INFINITY)
+                    if side.other.faces == 0 and seen > reach:
+                        enough = reach
+                    value = quick_clearance(known, side.other, x, enough)
+                    seen = value
                     seen_at = x
-                if d.value <= reach:
+                if value <= reach + side.slack:
+                    value, gradient, flat = distance_with_faces(known, model, side.other, side.band, x)
+                    seen = value
+                if value <= reach:
                     normal, flat = pressed_normal(
-                        pose, side.other.solid, known.facing[s], solid_normal(d.gradient), flat
+                        pose, side.other.solid, known.facing[s], solid_normal(gradient), flat
                     )
                     area = facing_area(pose, sample, normal)
                     # Finer samples say better where what is round presses on a face.
@@ -340,7 +369,7 @@ def list_side(
                         area = ZERO
                     # Samples on the far side of a thin body do not press.
                     if area > ZERO:
-                        touch = side_touch(side, pose, share, h, x, normal, d.value)
+                        touch = side_touch(side, pose, start, x, normal, value)
                         over = touch.gap - margin + gap
                         end = over - h * touch.nearing
                         early = fast and end < -sink
@@ -359,16 +388,43 @@ def list_side(
                             if flat == 2 or (flat == 1 and known.rim[s] == 0 and not on_face):
                                 own = pose.points * sample.area
                                 if flat == 2:
-                                    own = -solid_normal(d.gradient)
+                                    own = -solid_normal(gradient)
                                 if side.index.turning == 0 or flat == 2:
                                     touch.flat = 2
-                                    touch.slope = rotation_after(side.b, ZERO) * slope_of(own, normal)
+                                    touch.slope = start.turn * slope_of(own, normal)
                             touch.precedence = known.precedence[s]
                             touch.presses = wp.where(early or over < ZERO, 1, 0)
                             work.touches[at] = touch
                             at += 1
             block += 1
     return at
+
+
+@wp.func
+def are_apart(a: Part, b: Part, turn: mat33, other: mat33, way: vec3, reach: real) -> bool:
+    """Whether the boxes around two parts are further apart than `reach` [m] along one of their axes.
+
+    Args:
+        a: A part.
+        b: The other.
+        turn: Rotation of the first.
+        other: Of the second.
+        way: From the middle of the first to that of the second [m, W].
+        reach: The distance.
+    """
+    relative = wp.transpose(turn) * other
+    seen = wp.transpose(turn) * way
+    seen_back = wp.transpose(other) * way
+    apart = bool(False)
+    for i in range(3):
+        size = a.half[i] + reach
+        size_back = b.half[i] + reach
+        for j in range(3):
+            size += wp.abs(relative[i, j]) * b.half[j]
+            size_back += wp.abs(relative[j, i]) * a.half[j]
+        if wp.abs(seen[i]) > size or wp.abs(seen_back[i]) > size_back:
+            apart = True
+    return apart
 
 
 @wp.func
@@ -389,6 +445,14 @@ def list_pair(
     side = Side()
     side.index = known.index[second]
     side.other = known.index[first]
+    # Samples for which one stands that is asked.
+    each = ONE
+    # Of a polyhedron nothing is deeper in a half-space than a corner.
+    if side.other.solid == _HALF_SPACE and side.index.corner_blocks > 0:
+        side.index.first_block = side.index.first_corner_block
+        side.index.first_run = side.index.first_corner_run
+        side.index.blocks = side.index.corner_blocks
+        each = known.parts[second].corner_share
     settings = pair_settings(known, model, options, work.settings, world, pair)
     if settings.dim == ZERO:
         return begin
@@ -413,6 +477,10 @@ def list_pair(
             around = model.geom_rbound[world, side.other.geom]
         apart = middle - middle_of(part, side.b)
         if wp.dot(apart, apart) > (reach + around) * (reach + around):
+            return begin
+        turn = rotation_after(side.a, ZERO)
+        other = rotation_after(side.b, ZERO)
+        if are_apart(side.part, part, turn, other, apart, settings.margin + way):
             return begin
     if side.other.solid == _UNKNOWN:
         return -2 - side.other.geom
@@ -439,7 +507,7 @@ def list_pair(
         both = list_side(known, model, work, flipped, settings.margin, settings.gap, sink, way, h, n)
     if both == 0:
         return begin
-    return merge(work, begin, 0, both, options, settings, side.other, side.index, sink)
+    return merge(work, begin, 0, both, each, options, settings, side.other, side.index, sink)
 
 
 @wp.kernel(enable_backward=False)

@@ -19,11 +19,13 @@ from dano.mujoco.kernels.mixing import held_back, in_parallel, softened
 from dano.mujoco.kernels.tables import (
     ContactIndex,
     ContactRow,
+    Heads,
     Options,
     PartIndex,
     Settings,
     Touch,
     vec2,
+    vec8,
     vec9,
     Work,
 )
@@ -234,15 +236,6 @@ def spread_of(touches: wp.array(dtype=Touch), begin: int, end: int) -> real:
     return second / weight
 
 
-@wp.func(inline=True)
-def pull(head: Touch, touch: Touch, near: real) -> real:
-    """How much of a sample a head draws, beside others; `near`: ε² [m²]."""
-    arm = touch.position - head.position
-    facing = wp.max(ONE + wp.dot(touch.normal, head.normal), _AGAINST)
-    closeness = facing / (near + wp.dot(arm, arm))
-    return head.kept * closeness * closeness
-
-
 @wp.func
 def find_heads(work: wp.ref[Work], begin: int, end: int, most: int) -> int:
     """Say of each sample what it keeps, and list heads; how many."""
@@ -260,12 +253,91 @@ def find_heads(work: wp.ref[Work], begin: int, end: int, most: int) -> int:
 
 
 @wp.func
-def pull_on(work: wp.ref[Work], touch: Touch, heads: int, near: real) -> real:
-    """How much all heads draw a sample."""
-    total = ZERO
+def group_heads(work: wp.ref[Work], heads: int) -> int:
+    """Write heads in groups, and how many groups."""
+    groups = (heads + 7) // 8
+    for g in range(groups):
+        work.groups[g] = Heads()
     for k in range(heads):
-        total += pull(work.touches[work.heads[k]], touch, near)
+        head = work.heads[k]
+        g = k // 8
+        j = k - 8 * g
+        work.groups[g].x[j] = work.touches[head].position[0]
+        work.groups[g].y[j] = work.touches[head].position[1]
+        work.groups[g].z[j] = work.touches[head].position[2]
+        work.groups[g].normal_x[j] = work.touches[head].normal[0]
+        work.groups[g].normal_y[j] = work.touches[head].normal[1]
+        work.groups[g].normal_z[j] = work.touches[head].normal[2]
+        work.groups[g].kept[j] = work.touches[head].kept
+    return groups
+
+
+@wp.func
+def set_pulls(work: wp.ref[Work], groups: int, touch: Touch, near: real) -> real:
+    """Say how much each head draws a sample, beside others; and all of them together. `near`: ε² [m²]."""
+    one = vec8(ONE)
+    total = ZERO
+    for g in range(groups):
+        x = vec8(touch.position[0]) - work.groups[g].x
+        y = vec8(touch.position[1]) - work.groups[g].y
+        z = vec8(touch.position[2]) - work.groups[g].z
+        cosine = (
+            touch.normal[0] * work.groups[g].normal_x
+            + touch.normal[1] * work.groups[g].normal_y
+            + touch.normal[2] * work.groups[g].normal_z
+        )
+        facing = wp.max(one + cosine, vec8(_AGAINST))
+        apart = vec8(near) + wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
+        closeness = wp.cw_div(facing, apart)
+        pulls = wp.cw_mul(work.groups[g].kept, wp.cw_mul(closeness, closeness))
+        work.groups[g].pulls = pulls
+        total += wp.dot(pulls, one)
     return total
+
+
+@wp.func
+def give(work: wp.ref[Work], group: int, touch: Touch, shares: vec8):
+    """Add shares of a sample to what heads stand for."""
+    n = touch.normal
+    x = vec8(touch.position[0]) - work.groups[group].x
+    y = vec8(touch.position[1]) - work.groups[group].y
+    z = vec8(touch.position[2]) - work.groups[group].z
+    w = touch.weight * shares
+    work.groups[group].weight += w
+    work.groups[group].squares += touch.weight * w
+    work.groups[group].force_x += n[0] * w
+    work.groups[group].force_y += n[1] * w
+    work.groups[group].force_z += n[2] * w
+    work.groups[group].moment_x += wp.cw_mul(w, n[2] * y - n[1] * z)
+    work.groups[group].moment_y += wp.cw_mul(w, n[0] * z - n[2] * x)
+    work.groups[group].moment_z += wp.cw_mul(w, n[1] * x - n[0] * y)
+    work.groups[group].place_x += wp.cw_mul(w, x)
+    work.groups[group].place_y += wp.cw_mul(w, y)
+    work.groups[group].place_z += wp.cw_mul(w, z)
+    work.groups[group].gap += touch.gap * w
+    work.groups[group].nearing += touch.nearing * w
+
+
+@wp.func
+def gather(work: wp.ref[Work], begin: int, end: int, heads: int, near: real) -> int:
+    """Give all that samples do not keep to the heads; 1 if one of them presses."""
+    groups = group_heads(work, heads)
+    presses = int(0)
+    own = int(0)
+    for i in range(begin, end):
+        touch = work.touches[i]
+        presses = wp.max(presses, touch.presses)
+        left = (ONE - touch.kept) / set_pulls(work, groups, touch, near)
+        # Heads are in the order of samples.
+        is_head = own < heads and work.heads[wp.min(own, heads - 1)] == i
+        for g in range(groups):
+            shares = left * work.groups[g].pulls
+            if is_head and own // 8 == g:
+                shares[own - 8 * g] += touch.kept
+            give(work, g, touch, shares)
+        if is_head:
+            own += 1
+    return presses
 
 
 @wp.func
@@ -280,45 +352,30 @@ def tangents(n: vec3) -> vec9:
 
 
 @wp.func
-def led_touch(work: wp.ref[Work], head: int, begin: int, end: int, near: real) -> tuple[Touch, real]:
+def led_touch(work: wp.ref[Work], number: int, presses: int) -> tuple[Touch, real]:
     """One touch for the share of a head, and the number of samples that it stands for, (Σw)²/Σw².
 
-    Its weight times its normal is their force. It presses if one of them does.
+    Its weight times its normal is their force. It presses if one of them does: each has a share of all.
     """
-    merged = work.touches[head]
-    weight = ZERO
-    squares = ZERO
-    force = vec3()
-    moment = vec3()
-    place = vec3()
-    gap = ZERO
-    nearing = ZERO
-    for i in range(begin, end):
-        touch = work.touches[i]
-        w = (ONE - touch.kept) * pull(merged, touch, near) / touch.drawn
-        if i == head:
-            w += touch.kept
-        squares += w * touch.weight * touch.weight
-        w = w * touch.weight
-        arm = touch.position - merged.position
-        weight += w
-        force += w * touch.normal
-        moment += w * wp.cross(arm, touch.normal)
-        place += w * arm
-        gap += w * touch.gap
-        nearing += w * touch.nearing
-        merged.presses = wp.max(merged.presses, touch.presses)
+    g = number // 8
+    k = number - 8 * g
+    merged = work.touches[work.heads[number]]
+    merged.presses = presses
+    weight = work.groups[g].weight[k]
+    force = vec3(work.groups[g].force_x[k], work.groups[g].force_y[k], work.groups[g].force_z[k])
+    moment = vec3(work.groups[g].moment_x[k], work.groups[g].moment_y[k], work.groups[g].moment_z[k])
     squared = wp.dot(force, force)
     # Where normals oppose each other, no one contact does what they do, and the head stands for itself.
     if squared > HALF * HALF * weight * weight:
+        place = vec3(work.groups[g].place_x[k], work.groups[g].place_y[k], work.groups[g].place_z[k])
         place = place / weight
         moment -= wp.cross(place, force)
         merged.weight = wp.sqrt(squared)
         merged.position += place + wp.cross(force, moment) / squared
         merged.normal = force / merged.weight
-        merged.gap = gap / weight
-        merged.nearing = nearing / weight
-    return merged, weight * weight / squares
+        merged.gap = work.groups[g].gap[k] / weight
+        merged.nearing = work.groups[g].nearing[k] / weight
+    return merged, weight * weight / work.groups[g].squares[k]
 
 
 @wp.func
@@ -371,38 +428,39 @@ def merge(
     at: int,
     begin: int,
     end: int,
+    each: real,
     options: Options,
     settings: Settings,
     a: PartIndex,
     b: PartIndex,
     sink: real,
 ) -> int:
-    """Write touches as contacts, from a row on; the row beyond the last."""
+    """Write touches as contacts, from a row on; the row beyond the last. Each stands for so many samples."""
     most = int(options.most)
     bulge = Bulge()
     flat = flatness(work.touches, begin, end)
     if flat == 2:
         bulge = bulge_of(work, begin, end)
     if end - begin <= most:
+        fitted = in_parallel(settings, each, each > ONE)
         for i in range(begin, end):
             touch = lowest(work.touches[i], bulge)
-            write(work, at, touch, touch.presses == 1, settings, a, b, sink, options)
+            write(work, at, touch, touch.presses == 1, fitted, a, b, sink, options)
             at += 1
         return at
     set_scores(work, begin, end, flat == 1)
     heads = find_heads(work, begin, end, most)
     near = _SPREAD * spread_of(work.touches, begin, end) / real(most)
-    for i in range(begin, end):
-        work.touches[i].drawn = pull_on(work, work.touches[i], heads, near)
+    presses = gather(work, begin, end, heads, near)
     for k in range(heads):
-        touch, samples = led_touch(work, work.heads[k], begin, end, near)
+        touch, samples = led_touch(work, k, presses)
         touch = lowest(touch, bulge)
         write(
             work,
             at,
             touch,
             touch.presses == 1,
-            in_parallel(settings, samples, flat == 1),
+            in_parallel(settings, samples * each, flat == 1 or each > ONE),
             a,
             b,
             sink,

@@ -6,7 +6,7 @@ from dano.mujoco.kernels.tables import Known, Model, PartIndex
 from dano.mujoco.kernels.words import HEIGHTS, HULL
 from dano.physics.real import INFINITY, ONE, real, vec3, vec4, ZERO
 from dano.physics.solids.distances import leaf_clearance, leaf_distance
-from dano.physics.solids.grids import closest_in_grid, coarse_bound, place_in_grid
+from dano.physics.solids.grids import closest_in_grid, coarse_bound, grid_value, place_in_grid
 from dano.physics.solids.kinds import BOX, ELLIPSOID, GRID, HALF_SPACE
 from dano.physics.solids.leaves import Distance
 
@@ -69,17 +69,14 @@ def height_distance(model: Model, field: int, x: vec3) -> Distance:
     return d
 
 
-@wp.func(inline=True)
-def part_distance(known: Known, model: Model, part: PartIndex, x: vec3) -> Distance:
+@wp.func
+def part_distance(known: wp.ref[Known], model: wp.ref[Model], part: PartIndex, x: vec3) -> Distance:
     """Signed distance of a part's solid, and its gradient, at a point of its frame [m]."""
-    d = Distance()
     if part.solid == _HULL:
-        d = hull_distance(known, part, x)
-    elif part.solid == _HEIGHTS:
-        d = height_distance(model, part.at, x)
-    else:
-        d = leaf_distance(known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x)
-    return d
+        return hull_distance(known, part, x)
+    if part.solid == _HEIGHTS:
+        return height_distance(model, part.at, x)
+    return leaf_distance(known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x)
 
 
 @wp.func(inline=True)
@@ -91,7 +88,7 @@ def beyond(plane: vec4, x: vec3) -> real:
 @wp.func
 def distance_with_faces(
     known: wp.ref[Known], model: wp.ref[Model], part: PartIndex, band: real, x: vec3
-) -> tuple[Distance, int]:
+) -> tuple[real, vec3, int]:
     """`part_distance`, by the flat faces of an object where one of them is nearest; 1 if one is.
 
     Below or above a face, and nearer to its plane than to its edges, the distance is that of the plane. Where
@@ -123,23 +120,29 @@ def distance_with_faces(
             d.value = deepest
             d.gradient = of_deepest
             flat = 1
-    return d, flat
+    return d.value, d.gradient, flat
 
 
 @wp.func(inline=True)
-def grid_bound(known: Known, part: PartIndex, x: vec3) -> real:
-    """A lower bound on `part_distance` of an object [m]: that of a few cells, and the way to them."""
+def grid_bound(known: Known, part: PartIndex, x: vec3, enough: real) -> real:
+    """`part_distance` of an object [m], or a lower bound beyond `enough`: of a few cells, and the way."""
     leaf = known.solids.leaves[0, part.at]
     kind = known.solids.kinds[part.at]
     u = place_in_grid(leaf, (ONE / leaf.factor) * (wp.transpose(leaf.rotation) * (x - leaf.position)))
     closest = closest_in_grid(kind, u)
     away = wp.length(wp.cw_mul(u - closest, leaf.spacing))
-    return leaf.factor * (coarse_bound(known.solids, 0, kind, closest) + away)
+    bound = leaf.factor * (coarse_bound(known.solids, 0, kind, closest) + away)
+    if bound <= enough:
+        bound = leaf.factor * (grid_value(known.solids, 0, kind, closest) + away)
+    return bound
 
 
 @wp.func(inline=True)
-def quick_clearance(known: Known, part: PartIndex, x: vec3) -> real:
-    """A lower bound on the distance of a part's solid [m] where that takes far less than the distance."""
+def quick_clearance(known: Known, part: PartIndex, x: vec3, enough: real) -> real:
+    """A lower bound on the distance of a part's solid [m] where that takes far less than with its gradient.
+
+    Any that exceeds `enough` will do.
+    """
     bound = real(-INFINITY)
     if part.solid == _HALF_SPACE:
         # MuJoCo's planes are normal to their z axis.
@@ -153,7 +156,7 @@ def quick_clearance(known: Known, part: PartIndex, x: vec3) -> real:
         half = known.solids.leaves[0, part.at].sizes
         bound = wp.max(wp.abs(x[0]) - half[0], wp.max(wp.abs(x[1]) - half[1], wp.abs(x[2]) - half[2]))
     elif part.solid == _GRID:
-        bound = grid_bound(known, part, x)
+        bound = grid_bound(known, part, x, enough)
     return bound
 
 
@@ -167,11 +170,12 @@ def part_clearance(known: Known, model: Model, part: PartIndex, x: vec3, enough:
         # Heights are at most 1 of their scale.
         bound = x[2] - model.hfield_size[part.at][2]
     elif part.solid == _ELLIPSOID:
-        bound = quick_clearance(known, part, x)
+        bound = quick_clearance(known, part, x, enough)
     elif part.solid == _BOX:
-        bound = quick_clearance(known, part, x)
-        if bound <= enough:
-            bound = part_distance(known, model, part, x).value
+        bound = quick_clearance(known, part, x, enough)
+        if bound > ZERO and bound <= enough:
+            half = known.solids.leaves[0, part.at].sizes
+            bound = wp.length(wp.max(vec3(wp.abs(x[0]), wp.abs(x[1]), wp.abs(x[2])) - half, vec3()))
     else:
         bound = leaf_clearance(
             known.solids, 0, known.solids.kinds[part.at], known.solids.leaves[0, part.at], x, enough

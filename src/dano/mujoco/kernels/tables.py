@@ -17,6 +17,7 @@ RUN = 8
 
 vec2 = wp.types.vector(length=2, dtype=real)
 vec5 = wp.types.vector(length=5, dtype=real)
+vec8 = wp.types.vector(length=8, dtype=real)
 vec9 = wp.types.vector(length=9, dtype=real)
 
 
@@ -25,22 +26,26 @@ class Part:
     """A geom or an object.
 
     Attributes:
-        middle: Centre of a ball around an object [m]; geoms have it at their origin.
+        middle: Centre of a ball and of a box around an object [m]; geoms have it at their origin.
+        half: Half the sides of that box, along the axes of the frame [m]; endless where there is none.
         scale: Semi-axes of a ball or an ellipsoid, ones for others [m].
         radius: Of the ball around an object [m]; unused for geoms.
         thickness: Half of what is to be gone through at the thickest place [m].
         band: How far from their planes the flat faces of an object say its distance [m].
         slack: How much less than the sampled distance that may be [m].
         grain: Area of one of its samples [m²].
+        corner_share: Samples for which one of a polyhedron's corners stands.
     """
 
     middle: vec3
+    half: vec3
     scale: vec3
     radius: real
     thickness: real
     band: real
     slack: real
     grain: real
+    corner_share: real
 
 
 @wp.struct
@@ -53,6 +58,9 @@ class PartIndex:
     first_block: wp.int32  # Of its samples
     blocks: wp.int32  # How many it has; none where its samples are not asked
     first_run: wp.int32  # Of runs of its blocks
+    first_corner_block: wp.int32  # Of a polyhedron's corners, which are asked against half-spaces
+    corner_blocks: wp.int32  # How many of these there are; none for what is no polyhedron
+    first_corner_run: wp.int32  # Of runs of these
     turning: wp.int32  # How its samples turn
     solid: wp.int32  # Kind of its solid, see `dano.mujoco.kernels.solids`; −1 for none
     at: wp.int32  # Leaf of a solid of `dano.physics`, first plane of a hull, height field
@@ -189,8 +197,7 @@ class Touch:
         area: What of the sample's area faces the other body [m²].
         score: How much it counts as a head of others, see `dano.mujoco.kernels.merging`.
         precedence: See `Known`.
-        kept: Share of its weight that it keeps.
-        drawn: How much heads draw it; both see `dano.mujoco.kernels.merging`.
+        kept: Share of its weight that it keeps, see `dano.mujoco.kernels.merging`.
         presses: 0 where it only counts as near.
         flat: 1 where the normal is that of a flat face of an object, 2 where what is round presses on it.
     """
@@ -205,9 +212,59 @@ class Touch:
     score: real
     precedence: real
     kept: real
-    drawn: real
     presses: wp.int32
     flat: wp.int32
+
+
+@wp.struct
+class Heads:
+    """Eight heads, and what they stand for: sums over their shares w of loads. Arms are from the head on.
+
+    Attributes:
+        x: Where they are [m, W], by axis.
+        y: …
+        z: …
+        normal_x: Their normals [W], by axis.
+        normal_y: …
+        normal_z: …
+        kept: What they keep of their own load, 0 where there is no head.
+        pulls: How much they draw a sample.
+        weight: Σ w [m³].
+        squares: Σ w · load, with the whole load [m⁶].
+        force_x: Σ w n [m³], by axis.
+        force_y: …
+        force_z: …
+        moment_x: Σ w arm × n [m⁴], by axis.
+        moment_y: …
+        moment_z: …
+        place_x: Σ w arm [m⁴], by axis.
+        place_y: …
+        place_z: …
+        gap: Σ w · gap [m⁴].
+        nearing: Σ w · nearing [m⁴/s].
+    """
+
+    x: vec8
+    y: vec8
+    z: vec8
+    normal_x: vec8
+    normal_y: vec8
+    normal_z: vec8
+    kept: vec8
+    pulls: vec8
+    weight: vec8
+    squares: vec8
+    force_x: vec8
+    force_y: vec8
+    force_z: vec8
+    moment_x: vec8
+    moment_y: vec8
+    moment_z: vec8
+    place_x: vec8
+    place_y: vec8
+    place_z: vec8
+    gap: vec8
+    nearing: vec8
 
 
 @wp.struct
@@ -252,6 +309,7 @@ class Work:
     touches: wp.array(dtype=Touch)  # Room for the samples of a pair that touch
     scores: wp.array(dtype=real)  # Room for the highest of them, shape (most + 1,)
     heads: wp.array(dtype=wp.int32)  # Room for which of them are heads, shape (most,)
+    groups: wp.array(dtype=Heads)  # Room for them, eight in a group
     rows: wp.array(dtype=ContactRow)  # The contacts
     index: wp.array(dtype=ContactIndex)  # The same
     # Number of contacts, or −1 where sizes of geoms differ from those that are known; shape (1,).

@@ -7,6 +7,7 @@ from dano.mujoco.kernels.tables import (
     ContactIndex,
     ContactRow,
     Data,
+    Heads,
     Known,
     Model,
     Options,
@@ -52,6 +53,7 @@ class Rooms:
     touches: wp.array2d(dtype=Touch)  # Shape (worlds · k, samples of a pair)
     scores: wp.array2d(dtype=real)  # Shape (worlds · k, most + 1)
     heads: wp.array2d(dtype=wp.int32)  # Shape (worlds · k, most)
+    groups: wp.array2d(dtype=Heads)  # Shape (worlds · k, most / 8, rounded up)
     rows: wp.array2d(dtype=ContactRow)  # Shape (worlds · k, most)
     index: wp.array2d(dtype=ContactIndex)  # The same
 
@@ -109,6 +111,7 @@ def find_in_worlds(
     work.touches = rooms.touches[own]
     work.scores = rooms.scores[own]
     work.heads = rooms.heads[own]
+    work.groups = rooms.groups[own]
     work.rows = rooms.rows[own]
     work.index = rooms.index[own]
     told = options
