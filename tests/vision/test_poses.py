@@ -32,6 +32,8 @@ from dano.vision import (
     PoseOptions,
     save_transforms,
 )
+from dano.vision.structure._colmap import colmap
+from dano.vision.structure._features import number_by_name
 
 pytest.importorskip("pycolmap", reason="structure from motion needs the extra `poses`")
 
@@ -131,6 +133,28 @@ def near(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("near")
     write_pictures(folder, NEAR, tag=False)
     return folder
+
+
+def test_pictures_are_numbered_by_name_with_the_points_of_their_own(tmp_path: Path):
+    """Threads number them as they end: here b, d, a; c has another camera."""
+    library, file = colmap(), tmp_path / "database.db"
+    with library.Database.open(file) as database:
+        camera = library.Camera.create_from_model_id(0, library.CameraModelId.SIMPLE_PINHOLE, 100.0, 64, 48)
+        one, other = (database.write_camera(camera) for _ in range(2))
+        for name, key in (("b", one), ("c", other), ("d", one), ("a", one)):
+            number = database.write_image(library.Image(name=name, camera_id=key))
+            database.write_keypoints(number, np.full((ord(name), 4), ord(name), np.float32))
+            told = np.full((ord(name), 128), ord(name), np.uint8)
+            kind = library.FeatureExtractorType.SIFT
+            database.write_descriptors(number, library.FeatureDescriptors(type=kind, data=told))
+    number_by_name(file, ["b", "a", "d"])
+    with library.Database.open(file) as database:
+        images = database.read_all_images()
+        assert {image.image_id: image.name for image in images} == {1: "a", 2: "c", 3: "b", 4: "d"}
+        for image in images:
+            for read in (database.read_keypoints, lambda key: database.read_descriptors(key).data):
+                found = np.asarray(read(image.image_id))
+                assert len(found) == ord(image.name) and (found == ord(image.name)).all()
 
 
 @pytest.mark.slow

@@ -104,7 +104,7 @@ def find_matches(
                 lambda share=share: progress("looking for points", share),
             )
             done += len(chunk)
-        _number_by_name(database, [names[i] for i in members])
+        number_by_name(database, [names[i] for i in members])
     pairs = _pairs(len(names), ordered)
     for start in range(0, len(pairs), _PAIRS_CHUNK):
         chunk = [(names[a], names[b]) for a, b in pairs[start : start + _PAIRS_CHUNK]]
@@ -198,7 +198,7 @@ def _extract(
     )
 
 
-def _number_by_name(database: Path, names: list[str]) -> None:
+def number_by_name(database: Path, names: list[str]) -> None:
     """Give pictures of one camera numbers in the order of their names.
 
     Threads number them as they end. Their order decides in which order points and cameras are summed, and
