@@ -57,8 +57,9 @@ def leave_to_next(room: wp.ref[Room], world: int, k: int, h: real):
 def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h: real) -> bool:
     """Have both sides of a pair that have an impact meet at one moment: else its momentum would change.
 
-    The side that meets first says when. The other one takes part if it has met by then, too, but for δ. Else
-    it is left to the next step, unless the bodies rest on it: then impulses act from the start of the step.
+    The side that meets first says when, or that impulses do not wait. The other one takes part if it has met
+    by then, too, but for δ. Else it is left to the next step, unless the bodies rest on it: then impulses act
+    from the start of the step.
 
     Args:
         room: Where the sides stand.
@@ -72,6 +73,9 @@ def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h:
     """
     ahead = room.found[world, earlier]
     behind = room.found[world, later]
+    if ahead.impact.delays == ZERO:
+        room.found[world, later].impact = delayed(behind.impact, ZERO, behind.share, h)
+        return True
     way = (behind.share - ahead.share) * h * -behind.patch.near_rate / behind.patch.near_load
     until = ahead.impact.delays * ahead.share
     rests = way > behind.impact.depth and touches(room, world, behind)
@@ -126,42 +130,46 @@ def any_hits(room: wp.ref[Room], world: int, lane: int, n_found: int) -> bool:
 
 
 @wp.func
-def note_partner(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int, holds: bool):
-    """Note that a body has an impact with another one, or with several, and whether that one holds it."""
-    if scene.body_index[body].row >= 0:
-        if holds:
-            room.bodies[world, body].held = ONE
-        elif room.partners[world, body] == _NOBODY or room.partners[world, body] == other:
-            room.partners[world, body] = other
-        else:
-            room.partners[world, body] = _SEVERAL
+def note_partner(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int, hits: bool):
+    """Note that a body has an impact with another one, or is held by it: by one that moves as by several."""
+    if scene.body_index[body].row < 0:
+        return
+    partner = room.partners[world, body]
+    if hits:
+        room.partners[world, body] = wp.where(partner == _NOBODY or partner == other, other, _SEVERAL)
+    elif scene.body_index[other].row < 0:
+        room.bodies[world, body].held = ONE
+    else:
+        room.partners[world, body] = _SEVERAL
 
 
 @wp.func
 def find_partners(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, n_near: int):
-    """With which other one each body has an impact, and whether others hold it meanwhile."""
+    """With which other one each body has an impact, and whether fixed ones hold it meanwhile."""
     if lane == 0:
         for i in range(scene.body_index.shape[0]):
             room.partners[world, i] = _NOBODY
     for f in range(n_near):
         found = room.found[world, f * _LANES + lane]
-        quiet = bool(False)
+        hits = f >= n_found or found.impact.stiffness > ZERO
         holds = bool(False)
-        if f < n_found and found.impact.stiffness == ZERO:
-            quiet = is_quiet(scene, room, world, found)
-            holds = quiet and touches(room, world, found)
-        if lane == 0 and (holds or not quiet):
+        if not hits:
+            hits = not is_quiet(scene, room, world, found)
+            holds = not hits and touches(room, world, found)
+        if lane == 0 and (hits or holds):
             index = scene.pair_index[found.pair]
-            note_partner(scene, room, world, index.first, index.second, holds)
-            note_partner(scene, room, world, index.second, index.first, holds)
+            note_partner(scene, room, world, index.first, index.second, hits)
+            note_partner(scene, room, world, index.second, index.first, hits)
 
 
 @wp.func
-def waits(room: wp.ref[Room], world: int, body: int, other: int, found: FoundPair) -> int:
-    """1 where impulses on a body take effect when it meets another one, else 0."""
+def may_wait(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, other: int, found: FoundPair
+) -> bool:
+    """Whether impulses on a body may wait until it meets another one."""
     # What it rests on until then knows of no others.
     carried = wp.length_sq(found.support) > ZERO and room.bodies[world, body].held > ZERO
-    return wp.where(room.partners[world, body] == other and not carried, 1, 0)
+    return scene.body_index[body].row < 0 or (room.partners[world, body] == other and not carried)
 
 
 @wp.func
@@ -213,11 +221,13 @@ def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_fou
         found = room.found[world, f * _LANES]
         index = scene.pair_index[found.pair]
         met = vec3(ONE, found.impact.delays, found.impact.delays * found.share)
-        if found.first_waits > 0:
-            room.meetings[world, scene.body_index[index.first].row] += met
-        if found.second_waits > 0:
-            room.meetings[world, scene.body_index[index.second].row] += met
-        if found.first_waits + found.second_waits > 0 and wp.length_sq(found.support) > ZERO:
+        a = scene.body_index[index.first].row
+        b = scene.body_index[index.second].row
+        if found.waits > 0 and a >= 0:
+            room.meetings[world, a] += met
+        if found.waits > 0 and b >= 0:
+            room.meetings[world, b] += met
+        if found.waits > 0 and wp.length_sq(found.support) > ZERO:
             add_support(scene, room, world, found)
     for i in range(scene.moving.shape[0]):
         met = room.meetings[world, i]
@@ -231,10 +241,11 @@ def balance_when_met(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n_fou
 
 @wp.func
 def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int, n_near: int):
-    """Have impulses on a body that has an impact with one other, and at most lies on others, wait for it.
+    """Have impulses of a pair wait for their impact, where each body has one with no other one.
 
     What is hit from two sides would else go on by what one of them does until the other begins: in a corner
-    that friction jams, the two impulses have no bound.
+    that friction jams, the two impulses have no bound. Nor does a pair wait of which a body lies on a third
+    one that moves: piles would take twice the passes.
     """
     if not any_hits(room, world, lane, n_found):
         return
@@ -247,9 +258,11 @@ def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_
         found = room.found[world, k]
         if found.impact.delays > ZERO:
             index = scene.pair_index[found.pair]
-            found.first_waits = waits(room, world, index.first, index.second, found)
-            found.second_waits = waits(room, world, index.second, index.first, found)
-            if found.first_waits + found.second_waits == 0:
+            first = may_wait(scene, room, world, index.first, index.second, found)
+            second = may_wait(scene, room, world, index.second, index.first, found)
+            if first and second:
+                found.waits = 1
+            else:
                 found.impact = delayed(found.impact, ZERO, found.share, h)
             room.found[world, k] = found
     wait()

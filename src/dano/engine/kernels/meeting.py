@@ -7,6 +7,7 @@ from dano.engine.kernels.near import (
     find_near_blocks,
     gain_of,
     middle_of,
+    NearPair,
     Plane,
     plane_of,
     posed,
@@ -14,7 +15,7 @@ from dano.engine.kernels.near import (
     solid_of_body,
     stretch_of,
 )
-from dano.engine.kernels.tables import BLOCK, Body, Room, SamplePair, Scene
+from dano.engine.kernels.tables import BLOCK, Room, Scene
 from dano.physics.features import LANES, WIDE
 from dano.physics.pairs import (
     approach,
@@ -188,7 +189,7 @@ def look_at_block(
 
 @wp.func
 def most_nearing(
-    scene: wp.ref[Scene], world: int, solid: Solid, body: Body, a: BodyState, b: BodyState, way: real, h: real
+    scene: wp.ref[Scene], world: int, pair: NearPair, solid: Solid, a: BodyState, b: BodyState, way: real
 ) -> real:
     """Most by which a point of a body nears a solid within the step [m].
 
@@ -199,9 +200,69 @@ def most_nearing(
         if wp.length_sq(b.velocity) + wp.length_sq(b.spin) == ZERO:
             rotation = matrix(b.orientation)
             normal = rotation * solid_normal(solid_distance(scene.solids, world, solid, b.com).gradient)
+            body = scene.bodies[world, pair.first]
             lever = wp.length(middle_of(body, a) - a.position) + body.radius
-            most = wp.min(most, h * (wp.abs(wp.dot(normal, a.velocity)) + wp.length(a.spin) * lever))
+            most = wp.min(most, pair.h * (wp.abs(wp.dot(normal, a.velocity)) + wp.length(a.spin) * lever))
     return most
+
+
+@wp.struct
+class Limits:
+    """What counts as a meeting.
+
+    Attributes:
+        sink: Depth at which bodies meet [m].
+        least_way: Bodies that near each other by less in a step [m] are looked at at its end.
+        slow: Samples that near the other body by no more in a step [m] do not count.
+        since: Least τ, 0 or less: bodies that are deeper at the start of the step may have met in the one
+            before, which their velocities tell.
+    """
+
+    sink: real
+    least_way: real
+    slow: real
+    since: real
+
+
+@wp.func
+def limits_of(sink: real, least_way: real, slow: real, since: real) -> Limits:
+    """Limits of a meeting."""
+    limits = Limits()
+    limits.sink = sink
+    limits.least_way = least_way
+    limits.slow = slow
+    limits.since = since
+    return limits
+
+
+@wp.func
+def ask_of(
+    scene: wp.ref[Scene], world: int, pair: NearPair, a: BodyState, b: BodyState, limits: Limits
+) -> tuple[Ask, real]:
+    """What is asked of the samples of a pair, and how far anything may go in a step [m].
+
+    Where that is less than the least way, the most that nears the other body is zero.
+    """
+    ask = Ask()
+    solid = solid_of_body(scene, world, pair.second)
+    body = scene.bodies[world, pair.first]
+    way = way_of(a, b, middle_of(body, a), body.radius, pair.h)
+    most = most_nearing(scene, world, pair, solid, a, b, way)
+    if not (most <= limits.least_way):
+        # Seen from the second body, velocities turn with both bodies.
+        axis = matrix(a.orientation) * vec3(ZERO, ZERO, ONE)
+        turns = spin_of_samples(a.spin - b.spin, axis, pair.turning)
+        gain = pair.h * gain_of(a, b, wp.length(middle_of(body, a) - a.position) + body.radius)
+        way += real(1.5) * gain
+        ask.most = STEEPEST * (most + real(1.5) * gain)
+        ask.bend = way * pair.h * (wp.length(turns) + TWO * wp.length(b.spin)) + gain
+        ask.sink = limits.sink
+        ask.h = pair.h
+        ask.slow = limits.slow
+        ask.turning = pair.turning
+        ask.stretch = stretch_of(body, pair.turning)
+        ask.plane = plane_of(scene, world, solid, pair.turning, b.com)
+    return ask, way
 
 
 @wp.func
@@ -210,16 +271,10 @@ def meeting(
     room: wp.ref[Room],
     world: int,
     lane: int,
+    pair: NearPair,
     a: BodyState,
     b: BodyState,
-    pair: SamplePair,
-    first: int,
-    second: int,
-    h: real,
-    sink: real,
-    least_way: real,
-    slow: real,
-    since: real,
+    limits: Limits,
 ) -> Meeting:
     """When bodies have sunk into each other by a depth.
 
@@ -228,52 +283,16 @@ def meeting(
     on, by steps within which none can get there: l = v t + b t²/2 with l what is left of its way, v its speed
     and b a bound on how fast that grows, by turning. Along a line, distance to a convex solid grows no slower
     than its tangent; where nothing turns, this is Newton's method.
-
-    Args:
-        scene: The scene.
-        room: Room.
-        world: Which world.
-        lane: Which lane.
-        a: First body.
-        b: Second body.
-        pair: The pair.
-        first: Number of the first body.
-        second: … of the second.
-        h: Timestep [s].
-        sink: The depth [m].
-        least_way: Bodies that near each other by less in a step [m] are looked at at its end.
-        slow: Samples that near the other body by no more in a step [m] do not count.
-        since: Least τ, 0 or less: bodies that are deeper at the start of the step may have met in the one
-            before, which their velocities tell.
     """
     met = Meeting()
     met.critical = -1
     met.share = ONE
     met.least = -INFINITY
-    index = scene.body_index[first]
-    solid = solid_of_body(scene, world, second)
-    body = scene.bodies[world, first]
-    way = way_of(a, b, middle_of(body, a), body.radius, h)
-    most = most_nearing(scene, world, solid, body, a, b, way, h)
-    if most <= least_way:
+    ask, way = ask_of(scene, world, pair, a, b, limits)
+    if ask.most == ZERO:
         met.slow = True
         return met
-    # Seen from the second body, velocities turn with both bodies.
-    axis = matrix(a.orientation) * vec3(ZERO, ZERO, ONE)
-    turns = spin_of_samples(a.spin - b.spin, axis, index.turning)
-    gain = h * gain_of(a, b, wp.length(middle_of(body, a) - a.position) + body.radius)
-    way += real(1.5) * gain
-    most = STEEPEST * (most + real(1.5) * gain)
-    bend = way * h * (wp.length(turns) + TWO * wp.length(b.spin)) + gain
-    ask = Ask()
-    ask.sink = sink
-    ask.h = h
-    ask.slow = slow
-    ask.most = most
-    ask.bend = bend
-    ask.turning = index.turning
-    ask.stretch = stretch_of(body, index.turning)
-    ask.plane = plane_of(scene, world, solid, index.turning, b.com)
+    solid = solid_of_body(scene, world, pair.second)
     share = real(0.0)
     likely = int(-1)
     n = int(-1)
@@ -281,9 +300,9 @@ def meeting(
     at = lane * (room.near.shape[1] // _LANES)
     again = bool(True)
     while k < _ADVANCES:
-        pose = posed(scene, world, a, b, first, second, share, h, pair.follows)
+        pose = posed(scene, world, pair, a, b, share)
         if n < 0:
-            n, likely = find_near_blocks(scene, room, world, lane, pose, first, second, STEEPEST * way - sink)
+            n, likely = find_near_blocks(scene, room, world, lane, pair, pose, STEEPEST * way - limits.sink)
         seen = Soonest()
         seen.further = INFINITY
         seen.critical = -1
@@ -307,18 +326,18 @@ def meeting(
         if seen.critical >= 0:
             likely = seen.critical // _BLOCK
         if k == 0:
-            met.nears = least(-seen.fastest) < -slow
+            met.nears = least(-seen.fastest) < -limits.slow
             # Samples that were not asked do not sink in that far.
-            met.least = wp.min(least(seen.close), -sink)
+            met.least = wp.min(least(seen.close), -limits.sink)
         before = share
-        share = wp.max(share + closest, since)
+        share = wp.max(share + closest, limits.since)
         # What a block cannot do before a later moment says nothing of an earlier one.
         again = share < before
         k += 1
         if share >= ONE:
             met.critical = -1
             return met
-        met.critical = wp.where(share > since, critical, -1)
+        met.critical = wp.where(share > limits.since, critical, -1)
         if wp.abs(share - before) <= _MET:
             k = _ADVANCES
     met.share = share

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from dano.engine.kernels.tables import BLOCK, Body, FoundPair, Room, RUN, Scene
+from dano.engine.kernels.tables import BLOCK, Body, FoundPair, numbers_of, Room, RUN, SamplePair, Scene
 from dano.physics.features import LANES, TREES
 from dano.physics.impacts import share_left_out, supported
 from dano.physics.pairs import BodyState, facing_direction, falling, pair_pose, PairPose
@@ -16,6 +16,34 @@ from dano.physics.twists import wrench_at
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 _HALF_SPACE = wp.constant(HALF_SPACE)
+
+
+@wp.struct
+class NearPair:
+    """A pair as a step looks at it."""
+
+    place: int  # In `Scene.pair_index`
+    first: int  # Its bodies
+    second: int
+    contact: int  # Of `Scene.materials`
+    turning: int  # How samples of the first body turn
+    h: real  # Timestep [s]
+    numbers: SamplePair
+
+
+@wp.func
+def near_pair(scene: wp.ref[Scene], world: int, place: int) -> NearPair:
+    """The pair at a place."""
+    index = scene.pair_index[place]
+    pair = NearPair()
+    pair.place = place
+    pair.first = index.first
+    pair.second = index.second
+    pair.contact = index.contact
+    pair.turning = scene.body_index[index.first].turning
+    pair.h = scene.timestep[world, 0]
+    pair.numbers = numbers_of(scene, world, place)
+    return pair
 
 
 @wp.func
@@ -59,6 +87,17 @@ def reach_of_block(
         across = wp.sqrt(wp.max(ONE - along * along, ZERO))
         return wp.min(radius, slab[3] * wp.abs(along) + radius * across)
     return radius
+
+
+@wp.func
+def is_run_far(
+    scene: wp.ref[Scene], world: int, solid: Solid, pose: PairPose, block: int, way: real, stretch: real
+) -> bool:
+    """Whether all blocks of the run that begins with one are further from a solid than a way [m]."""
+    run = scene.runs[world, block]
+    x = pose.points * vec3(run[0], run[1], run[2]) + pose.origin
+    far = way + STEEPEST * run[3] * stretch
+    return solid_clearance(scene.solids, world, solid, x, far) > far
 
 
 @wp.func
@@ -139,39 +178,21 @@ def as_they_meet(a: BodyState, b: BodyState, found: FoundPair, h: real) -> tuple
 
 
 @wp.func
-def facing(
-    scene: wp.ref[Scene],
-    world: int,
-    a: BodyState,
-    b: BodyState,
-    first: int,
-    second: int,
-    share: real,
-    h: real,
-) -> vec3:
+def facing(scene: wp.ref[Scene], world: int, pair: NearPair, a: BodyState, b: BodyState, share: real) -> vec3:
     """Direction that samples of the first body face after a share of the step [F]."""
-    solid = solid_of_body(scene, world, second)
-    index = scene.body_index[first]
-    scale = scene.bodies[world, first].scale
-    return facing_direction(scene.solids, world, solid, a, b, share, h, index.turning, scale)
+    solid = solid_of_body(scene, world, pair.second)
+    scale = scene.bodies[world, pair.first].scale
+    return facing_direction(scene.solids, world, solid, a, b, share, pair.h, pair.turning, scale)
 
 
 @wp.func
 def posed(
-    scene: wp.ref[Scene],
-    world: int,
-    a: BodyState,
-    b: BodyState,
-    first: int,
-    second: int,
-    share: real,
-    h: real,
-    follows: real,
+    scene: wp.ref[Scene], world: int, pair: NearPair, a: BodyState, b: BodyState, share: real
 ) -> PairPose:
     """Pose of a pair after a share of the step."""
-    toward = facing(scene, world, a, b, first, second, share, h)
-    turning = scene.body_index[first].turning
-    return pair_pose(a, b, share, h, toward, turning, scene.bodies[world, first].scale, follows)
+    toward = facing(scene, world, pair, a, b, share)
+    scale = scene.bodies[world, pair.first].scale
+    return pair_pose(a, b, share, pair.h, toward, pair.turning, scale, pair.numbers.follows)
 
 
 @wp.func
@@ -180,9 +201,8 @@ def find_near_blocks(
     room: wp.ref[Room],
     world: int,
     lane: int,
+    pair: NearPair,
     pose: PairPose,
-    first: int,
-    second: int,
     way: real,
 ) -> tuple[int, int]:
     """Blocks with samples no further from the solid than anything moves in a step, into `room.near`.
@@ -192,8 +212,8 @@ def find_near_blocks(
     Returns:
         Number of blocks, and the one that comes closest, −1 where there is none.
     """
-    index = scene.body_index[first]
-    solid = solid_of_body(scene, world, second)
+    index = scene.body_index[pair.first]
+    solid = solid_of_body(scene, world, pair.second)
     closest = INFINITY
     lowest = int(-1)
     found = int(0)
@@ -207,12 +227,9 @@ def find_near_blocks(
                 if i < beyond:
                     listed = False
                 elif i % _RUN == 0:
-                    run = scene.runs[world, b]
-                    x = pose.points * vec3(run[0], run[1], run[2]) + pose.origin
-                    far = way + STEEPEST * run[3]
-                    if solid_clearance(scene.solids, world, solid, x, far) > far:
+                    listed = not is_run_far(scene, world, solid, pose, b, way, ONE)
+                    if not listed:
                         beyond = i + _RUN
-                        listed = False
             if listed:
                 ball = scene.balls[world, b]
                 x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin

@@ -9,12 +9,15 @@ import warp as wp
 
 from dano.engine.kernels.impacts import share_impacts
 from dano.engine.kernels.lanes import lanes_where, total, total3
-from dano.engine.kernels.meeting import Meeting, meeting
+from dano.engine.kernels.meeting import Limits, limits_of, Meeting, meeting
 from dano.engine.kernels.near import (
     as_they_meet,
     facing,
     is_near,
+    is_run_far,
     left_out,
+    near_pair,
+    NearPair,
     plane_of,
     posed,
     reach_of_block,
@@ -27,10 +30,8 @@ from dano.engine.kernels.tables import (
     BLOCK,
     FoundPair,
     FoundPoint,
-    numbers_of,
     Room,
     RUN,
-    SamplePair,
     Scene,
 )
 from dano.physics.features import LANES, TREES
@@ -67,7 +68,6 @@ from dano.physics.samples import (
     solid_normal,
 )
 from dano.physics.solids.distances import solid_clearance, solid_distance
-from dano.physics.solids.grids import STEEPEST
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
 
@@ -125,44 +125,81 @@ def block_share(lane: int, bits: wp.uint32) -> BlockShare:
     return share
 
 
+@wp.struct
+class Moment:
+    """How points of a pair are listed at a moment.
+
+    Attributes:
+        share: The share of the step after which geometry is taken.
+        rests: `share_left_out` of the pair.
+        turned: Whether it is about samples that face the other way.
+        entry: Place of the pair among those that are near.
+        end: Beyond the last place of the list.
+    """
+
+    share: real
+    rests: real
+    turned: bool
+    entry: int
+    end: int
+
+
+@wp.struct
+class Listed:
+    """What a list of points has.
+
+    Attributes:
+        at: Place of the next point, which may lie beyond the end of the list.
+        patch: With the samples that have sunk in.
+        load: Of these [m³].
+        turned_load: Of samples that lie in the solid and face the other way [m³].
+    """
+
+    at: int
+    patch: Patch
+    load: real
+    turned_load: real
+
+
+@wp.func
+def add_to_patch(patch: Patch, own: Patch) -> Patch:
+    """A patch with what a sample adds."""
+    whole = patch
+    whole.load += own.load
+    whole.arm += own.arm
+    whole.normal += own.normal
+    whole.near_load += own.near_load
+    whole.near_rate += own.near_rate
+    return whole
+
+
 @wp.func
 def find_points(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
     world: int,
     lane: int,
+    pair: NearPair,
     pose: PairPose,
-    pair: SamplePair,
-    first: int,
-    second: int,
-    entry: int,
-    share: real,
-    h: real,
-    bounce: real,
-    rests: real,
-    turned: bool,
-    begin: int,
-    end: int,
-    patch: Patch,
-) -> tuple[int, Patch, real, real]:
-    """List the samples of a body that may press; with `turned` those that face the other way.
-
-    Returns:
-        Place of the next point in the list, which may lie beyond its end, the patch with the samples that
-        have sunk in, their load, and that of samples that lie in the solid and face the other way [m³].
-    """
-    load = real(0.0)
-    turned_load = real(0.0)
-    index = scene.body_index[first]
-    solid = solid_of_body(scene, world, second)
-    body = scene.bodies[world, first]
-    stretch = stretch_of(body, index.turning)
-    plane = plane_of(scene, world, solid, index.turning, pose.origin)
+    moment: Moment,
+    before: Listed,
+) -> Listed:
+    """List the samples of a body that may press, behind those that are listed."""
+    found = before
+    share = moment.share
+    h = pair.h
+    depth = pair.numbers.impact_depth
+    margin = pair.numbers.margin
+    bounce = scene.materials[world, pair.contact].bounce
+    index = scene.body_index[pair.first]
+    solid = solid_of_body(scene, world, pair.second)
+    body = scene.bodies[world, pair.first]
+    stretch = stretch_of(body, pair.turning)
+    plane = plane_of(scene, world, solid, pair.turning, pose.origin)
     # No motion within the step takes a sample from beyond reach to the margin.
     rest = (ONE - share) * h
-    sinks = wp.where(share < ONE, pair.impact_depth, ZERO)
-    reach = wp.max(pair.margin + rest * speed_within(pose, pose.com, TWO * body.radius), sinks)
-    at = begin
+    sinks = wp.where(share < ONE, depth, ZERO)
+    reach = wp.max(margin + rest * speed_within(pose, pose.com, TWO * body.radius), sinks)
     beyond = int(0)
     # All lanes go through as many rounds: samples of the blocks that are listed in one are shared.
     for i in range(lane, (index.blocks + _LANES - 1) // _LANES * _LANES, _LANES):
@@ -172,20 +209,16 @@ def find_points(
             if i < beyond:
                 listed = False
             elif i % _RUN == 0:
-                # Where a run of blocks is out of reach, all of them are.
-                run = scene.runs[world, b]
-                x = pose.points * vec3(run[0], run[1], run[2]) + pose.origin
-                far = reach + STEEPEST * run[3] * stretch
-                if solid_clearance(scene.solids, world, solid, x, far) > far:
+                listed = not is_run_far(scene, world, solid, pose, b, reach, stretch)
+                if not listed:
                     beyond = i + _RUN
-                    listed = False
         near = reach
         if listed:
             ball = scene.balls[world, b]
             x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
-            if index.turning == 0:
+            if pair.turning == 0:
                 # Samples that are fixed to the body move as the middle of their block, or nearly.
-                near = wp.min(reach, wp.max(pair.margin + rest * speed_within(pose, x, ball[3]), sinks))
+                near = wp.min(reach, wp.max(margin + rest * speed_within(pose, x, ball[3]), sinks))
             far = near + reach_of_block(scene, world, pose, plane, b, stretch)
             listed = solid_clearance(scene.solids, world, solid, x, far) <= far
         left = lanes_where(lane, listed)
@@ -202,85 +235,103 @@ def find_points(
                     back = bool(False)
                     if d.value < ZERO and facing < ZERO:
                         back = is_turned(pose, sample, d, facing)
-                        if back and not turned:
-                            turned_load -= d.value * pair.share * wp.length(pose.vectors * sample.area)
-                    if (turned and back) or (not turned and facing > ZERO):
-                        point = point_contact(pose, sample, d, index.turning, turned, pair.share, share * h)
-                        in_patch = not turned and point.sunk > -pair.impact_depth
-                        if point.depth - h * point.rate > -pair.margin or (share < ONE and in_patch):
+                        if back and not moment.turned:
+                            area = pair.numbers.share * wp.length(pose.vectors * sample.area)
+                            found.turned_load -= d.value * area
+                    if (moment.turned and back) or (not moment.turned and facing > ZERO):
+                        point = point_contact(
+                            pose, sample, d, pair.turning, moment.turned, pair.numbers.share, share * h
+                        )
+                        in_patch = not moment.turned and point.sunk > -depth
+                        if point.depth - h * point.rate > -margin or (share < ONE and in_patch):
                             if in_patch:
-                                load += point.area * wp.max(point.sunk, ZERO)
+                                found.load += point.area * wp.max(point.sunk, ZERO)
                                 own = patch_of_sample(
-                                    point.area, point.sunk, pair.impact_depth, point.approach, bounce,
-                                    rests, point.arm, point.normal,
+                                    point.area, point.sunk, depth, point.approach, bounce, moment.rests,
+                                    point.arm, point.normal,
                                 )  # fmt: skip
-                                patch.load += own.load
-                                patch.arm += own.arm
-                                patch.normal += own.normal
-                                patch.near_load += own.near_load
-                                patch.near_rate += own.near_rate
-                            if at < end:
-                                list_point(room, world, at, point, s, entry, turned)
-                            at += 1
-    return at, patch, load, turned_load
+                                found.patch = add_to_patch(found.patch, own)
+                            if found.at < moment.end:
+                                list_point(room, world, found.at, point, s, moment.entry, moment.turned)
+                            found.at += 1
+    return found
+
+
+@wp.func
+def list_points(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    lane: int,
+    pair: NearPair,
+    pose: PairPose,
+    moment: Moment,
+    begin: int,
+) -> Listed:
+    """List the points of a pair at a moment; the patch that is returned is that of all lanes."""
+    found = Listed()
+    found.at = begin
+    found = find_points(scene, room, world, lane, pair, pose, moment, found)
+    found.patch.load = total(found.patch.load)
+    found.patch.near_load = total(found.patch.near_load)
+    found.patch.near_rate = total(found.patch.near_rate)
+    found.patch.arm = total3(found.patch.arm)
+    found.patch.normal = total3(found.patch.normal)
+    # What faces the other way presses where its load is the larger one.
+    if total(found.turned_load) > total(found.load):
+        back = moment
+        back.turned = True
+        found = find_points(scene, room, world, lane, pair, pose, back, found)
+    return found
 
 
 @wp.func
 def impact_of(
-    a: BodyState,
-    b: BodyState,
-    patch: Patch,
-    material: Material,
-    found: FoundPair,
-    pair: SamplePair,
-    turning: int,
-    alone: bool,
+    a: BodyState, b: BodyState, material: Material, found: FoundPair, pair: NearPair, alone: bool, waits: bool
 ) -> Impact:
     """The impact of a pair; none where it approaches slowly.
 
     Args:
         a: First body.
         b: Second body.
-        patch: Samples that have sunk in.
         material: Of the contact.
-        found: What is found of the pair.
+        found: What is found of the pair, with its patch.
         pair: The pair.
-        turning: How samples turn with the first body.
         alone: Whether one of the bodies is fixed.
+        waits: Whether impulses may wait until the bodies meet.
     """
-    impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, material.timestep)
-    if patch.load > ZERO:
-        impact.share = share_of_impact(patch, material.bounce)
+    numbers = pair.numbers
+    impact = no_impact(numbers.impact_depth, numbers.factor, numbers.deepest, pair.h)
+    if found.patch.load > ZERO:
+        impact.share = share_of_impact(found.patch, material.bounce)
         if impact.share > ZERO and found.hits > 0:
-            impact.stiffness = stiffness_of_impact(
-                a, b, patch, material.bounce, pair.factor, material.timestep
-            )
-            delays = real(0.0)
-            if wp.static(not TREES):
-                delays = impact.share
-            impact = delayed(impact, delays, found.share, material.timestep)
-            impact.rests = left_out(found, pair.factor)
+            impact.stiffness = stiffness_of_impact(a, b, found.patch, material.bounce, numbers.factor, pair.h)
+            impact = delayed(impact, wp.where(waits, impact.share, ZERO), found.share, pair.h)
+            impact.rests = left_out(found, numbers.factor)
             if alone:
-                impact.turns = turning_after(a, b, patch, material.friction, found.share, turning)
+                impact.turns = turning_after(a, b, found.patch, material.friction, found.share, pair.turning)
     return impact
 
 
 @wp.func
 def find_rest(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, a: BodyState, b: BodyState, p: int
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    lane: int,
+    pair: NearPair,
+    a: BodyState,
+    b: BodyState,
 ) -> Rest:
     """What a pair rests on when the step begins."""
     rest = Rest()
-    index = scene.pair_index[p]
-    pair = numbers_of(scene, world, p)
-    samples = scene.body_index[index.first]
-    bounce = scene.materials[world, index.contact].bounce
-    solid = solid_of_body(scene, world, index.second)
-    h = scene.timestep[world, 0]
-    pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
-    stretch = stretch_of(scene.bodies[world, index.first], samples.turning)
-    plane = plane_of(scene, world, solid, samples.turning, pose.origin)
-    fall = fall_of(a, b, pair.impact_depth, h)
+    samples = scene.body_index[pair.first]
+    bounce = scene.materials[world, pair.contact].bounce
+    solid = solid_of_body(scene, world, pair.second)
+    pose = posed(scene, world, pair, a, b, ZERO)
+    stretch = stretch_of(scene.bodies[world, pair.first], pair.turning)
+    plane = plane_of(scene, world, solid, pair.turning, pose.origin)
+    fall = fall_of(a, b, pair.numbers.impact_depth, pair.h)
     for i in range(lane, samples.blocks, _LANES):
         block = samples.first_block + i
         ball = scene.balls[world, block]
@@ -291,7 +342,7 @@ def find_rest(
                 sample = scene.samples[world, s]
                 d = solid_distance(scene.solids, world, solid, position_in_solid(pose, sample.point))
                 if d.value < fall and facing_area(pose, sample, solid_normal(d.gradient)) > ZERO:
-                    point = point_contact(pose, sample, d, samples.turning, False, pair.share, ZERO)
+                    point = point_contact(pose, sample, d, pair.turning, False, pair.numbers.share, ZERO)
                     own = rest_of_sample(point.depth, fall, point.approach, bounce, point.arm, point.normal)
                     rest.load += own.load
                     rest.near += own.near
@@ -306,24 +357,94 @@ def find_rest(
     return rest
 
 
+@wp.struct
+class Coming:
+    """How a pair comes to meet within a step.
+
+    Attributes:
+        met: When.
+        lasts: Whether its contact lasts: it has no impact.
+        alone: Whether one of the bodies is fixed.
+        waits: Whether impulses may wait until the bodies meet.
+        first_falls: 1 where the first body falls freely meanwhile; others hold what hardly moves.
+        second_falls: The same of the second one.
+        rest: What it rests on when the step begins.
+        support: Impulse of that, see `FoundPair.support`.
+    """
+
+    met: Meeting
+    lasts: bool
+    alone: bool
+    waits: bool
+    first_falls: int
+    second_falls: int
+    rest: Rest
+    support: vec6
+
+
 @wp.func
-def lasting_meeting(
+def limits_of_lasting(pair: NearPair) -> Limits:
+    """Of bodies in contact that lasts: as deep as geometry is predicted, what presses holds them."""
+    sink = wp.max(pair.numbers.sink, pair.numbers.impact_depth)
+    return limits_of(sink, sink, ZERO, ZERO)
+
+
+@wp.func
+def coming_of(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
     world: int,
     lane: int,
+    pair: NearPair,
     a: BodyState,
     b: BodyState,
-    pair: SamplePair,
-    first: int,
-    second: int,
-    h: real,
-    sink: real,
-) -> Meeting:
-    """When bodies in contact that lasts are as deep as geometry is predicted: what presses holds them."""
-    return meeting(
-        scene, room, world, lane, falling(a, 0), falling(b, 0), pair, first, second, h, sink, sink, ZERO, ZERO
-    )
+) -> Coming:
+    """How a pair comes to meet: geometry of an impact is that of bodies that are as deep as in one."""
+    material = scene.materials[world, pair.contact]
+    # Slower than this nothing has an impact.
+    slow = pair.h * material.bounce
+    limits = limits_of(pair.numbers.impact_depth, slow, slow, ZERO)
+    coming = Coming()
+    coming.first_falls = 1
+    coming.second_falls = 1
+    if wp.static(not TREES):
+        coming.alone = scene.body_index[pair.first].row < 0 or scene.body_index[pair.second].row < 0
+        limits.since = -ONE
+        if not coming.alone:
+            coming.first_falls = wp.where(hardly_moves(a), 0, 1)
+            coming.second_falls = wp.where(hardly_moves(b), 0, 1)
+    coming.lasts = material.instant == ZERO
+    if not coming.lasts:
+        seen = falling(a, coming.first_falls)
+        other = falling(b, coming.second_falls)
+        coming.met = meeting(scene, room, world, lane, pair, seen, other, limits)
+        if not coming.alone and coming.met.share <= -ONE:
+            # Two that move and have been in each other for longer meet as the step begins, and do not wait.
+            limits.since = ZERO
+            coming.met = meeting(scene, room, world, lane, pair, seen, other, limits)
+        # What moves so slowly has no impact.
+        coming.lasts = coming.met.slow
+    coming.waits = limits.since < ZERO
+    if coming.lasts:
+        coming.met = meeting(
+            scene, room, world, lane, pair, falling(a, 0), falling(b, 0), limits_of_lasting(pair)
+        )
+    if wp.static(not TREES):
+        if coming.alone and not coming.lasts and coming.met.share < ONE and coming.met.nears:
+            # What it rests on goes on to press until it meets, and says when that is.
+            coming.rest = find_rest(scene, room, world, lane, pair, a, b)
+            if coming.rest.load > ZERO:
+                seen = falling(a, 1)
+                other = falling(b, 1)
+                coming.support = support_of(seen, other, coming.rest, material.friction, pair.h, pair.turning)
+                found = FoundPair()
+                found.first_falls = 1
+                found.second_falls = 1
+                found.support = coming.support
+                seen, other = as_they_meet(a, b, found, pair.h)
+                limits.sink = depth_beside(coming.rest, pair.numbers.impact_depth)
+                coming.met = meeting(scene, room, world, lane, pair, seen, other, limits)
+    return coming
 
 
 @wp.func
@@ -338,101 +459,53 @@ def find_pair(
     Returns:
         Place of the next point in the list, which may lie beyond its end.
     """
-    h = scene.timestep[world, 0]
-    pair = numbers_of(scene, world, p)
-    index = scene.pair_index[p]
-    a = room.bodies[world, index.first]
-    b = room.bodies[world, index.second]
-    material = scene.materials[world, index.contact]
-    alone = bool(False)
-    # Others hold what hardly moves.
-    first_falls = int(1)
-    second_falls = int(1)
-    since = real(0.0)
-    if wp.static(not TREES):
-        alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
-        since = -ONE
-        if not alone:
-            first_falls = wp.where(hardly_moves(a), 0, 1)
-            second_falls = wp.where(hardly_moves(b), 0, 1)
+    pair = near_pair(scene, world, p)
+    numbers = pair.numbers
+    a = room.bodies[world, pair.first]
+    b = room.bodies[world, pair.second]
+    material = scene.materials[world, pair.contact]
+    coming = coming_of(scene, room, world, lane, pair, a, b)
+    met = coming.met
+    lasts = coming.lasts
     found = FoundPair()
     found.pair = p
     found.first = at
     found.com_difference = a.position - b.position
-    turning = scene.body_index[index.first].turning
-    # Slower than this nothing has an impact.
-    slow = h * material.bounce
-    sink = wp.max(pair.sink, pair.impact_depth)
-    lasts = material.instant == ZERO
-    met = Meeting()
-    if not lasts:
-        met = meeting(
-            scene, room, world, lane, falling(a, first_falls), falling(b, second_falls), pair, index.first,
-            index.second, h, pair.impact_depth, slow, slow, since,
-        )  # fmt: skip
-        # What moves so slowly has no impact.
-        lasts = met.slow
-    if lasts:
-        met = lasting_meeting(scene, room, world, lane, a, b, pair, index.first, index.second, h, sink)
-    if wp.static(not TREES):
-        if alone and not lasts and met.share < ONE and met.nears:
-            # What it rests on goes on to press until it meets, and says when that is.
-            found.rest = find_rest(scene, room, world, lane, a, b, p)
-            if found.rest.load > ZERO:
-                found.first_falls = 1
-                found.second_falls = 1
-                seen = falling(a, 1)
-                other = falling(b, 1)
-                found.support = support_of(seen, other, found.rest, material.friction, h, turning)
-                seen, other = as_they_meet(a, b, found, h)
-                met = meeting(
-                    scene, room, world, lane, seen, other, pair, index.first, index.second, h,
-                    depth_beside(found.rest, pair.impact_depth), slow, slow, since,
-                )  # fmt: skip
+    found.rest = coming.rest
+    found.support = coming.support
     after = at
     again = bool(True)
     while again:
         again = False
         found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
-        found.first_falls = wp.where(not lasts and met.nears, first_falls, 0)
-        found.second_falls = wp.where(not lasts and met.nears, second_falls, 0)
+        found.first_falls = wp.where(not lasts and met.nears, coming.first_falls, 0)
+        found.second_falls = wp.where(not lasts and met.nears, coming.second_falls, 0)
         if lasts or not met.nears:
             found.support = vec6()
         found.critical = met.critical
         found.share = met.share
-        rests = left_out(found, pair.factor)
-        seen, other = as_they_meet(a, b, found, h)
-        pose = posed(scene, world, seen, other, index.first, index.second, met.share, h, pair.follows)
-        patch = Patch()
-        after, patch, load, turned_load = find_points(
-            scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
-            material.bounce, rests, False, at, end, patch,
-        )  # fmt: skip
-        patch.load = total(patch.load)
-        patch.near_load = total(patch.near_load)
-        patch.near_rate = total(patch.near_rate)
-        patch.arm = total3(patch.arm)
-        patch.normal = total3(patch.normal)
-        # What faces the other way presses where its load is the larger one.
-        if total(turned_load) > total(load):
-            after, patch, _load, _turned = find_points(
-                scene, room, world, lane, pose, pair, index.first, index.second, entry, met.share, h,
-                material.bounce, rests, True, after, end, patch,
-            )  # fmt: skip
-        found.patch = patch
-        found.impact = no_impact(pair.impact_depth, pair.factor, pair.deepest, h)
+        moment = Moment()
+        moment.share = met.share
+        moment.rests = left_out(found, numbers.factor)
+        moment.entry = entry
+        moment.end = end
+        seen, other = as_they_meet(a, b, found, pair.h)
+        pose = posed(scene, world, pair, seen, other, met.share)
+        listed = list_points(scene, room, world, lane, pair, pose, moment, at)
+        after = listed.at
+        found.patch = listed.patch
+        found.impact = no_impact(numbers.impact_depth, numbers.factor, numbers.deepest, pair.h)
         if not lasts:
-            found.impact = impact_of(seen, other, patch, material, found, pair, turning, alone)
+            found.impact = impact_of(seen, other, material, found, pair, coming.alone, coming.waits)
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share
-            if before < ONE or met.least < -sink:
-                met = lasting_meeting(
-                    scene, room, world, lane, a, b, pair, index.first, index.second, h, sink
-                )
+            limits = limits_of_lasting(pair)
+            if before < ONE or met.least < -limits.sink:
+                met = meeting(scene, room, world, lane, pair, falling(a, 0), falling(b, 0), limits)
             again = met.share != before or found.first_falls + found.second_falls > 0
-    seen, other = as_they_meet(a, b, found, h)
-    found.toward = facing(scene, world, seen, other, index.first, index.second, found.share, h)
+    seen, other = as_they_meet(a, b, found, pair.h)
+    found.toward = facing(scene, world, pair, seen, other, found.share)
     found.end = wp.min(after, end)
     room.found[world, entry * _LANES + lane] = found
     return after

@@ -210,9 +210,7 @@ class FoundPair:
     # 1 where the first or the second body falls freely until they meet: then gravity takes part in its way.
     first_falls: wp.int32
     second_falls: wp.int32
-    # 1 where impulses of an impact on the first or the second body take effect when the bodies meet.
-    first_waits: wp.int32
-    second_waits: wp.int32
+    waits: wp.int32  # 1 where impulses of an impact take effect when the bodies meet
     impact: Impact  # Of the pair
     patch: Patch  # Its samples that have sunk in
     rest: Rest  # Samples that it rests on when the step begins, where it has an impact, too

@@ -30,6 +30,7 @@ from dano.engine.kernels.near import (
     as_they_meet,
     facing,
     left_out,
+    near_pair,
     posed,
     solid_of_body,
 )
@@ -299,12 +300,13 @@ def pull_support(
     h = scene.timestep[world, 0]
     a = falling(room.bodies[world, index.first], found.first_falls)
     b = falling(room.bodies[world, index.second], found.second_falls)
-    toward = facing(scene, world, a, b, index.first, index.second, ZERO, h)
+    near = near_pair(scene, world, found.pair)
+    toward = facing(scene, world, near, a, b, ZERO)
     at = met_pair(scene, world, found, a, b, ZERO, toward)
     samples = Touching()
     samples.material = scene.materials[world, index.contact]
     samples.timestep = h
-    samples.pose = posed(scene, world, a, b, index.first, index.second, ZERO, h, pair.follows)
+    samples.pose = posed(scene, world, near, a, b, ZERO)
     samples.fall = fall_of(a, b, pair.impact_depth, h)
     asked = Asked()
     whole, by_rest, by_depth, by_material, by_factor, _a, _b, _c, _d, _e = wp.grad(support_work)(
@@ -383,7 +385,7 @@ def pull_waiting(
     `bar` has those by when impulses on its bodies take effect, of its own: they are known by then.
     """
     own = waiting
-    own.met += real(found.first_waits) * bar.first.met + real(found.second_waits) * bar.second.met
+    own.met += bar.first.met + bar.second.met
     whole = bar
     whole.first.met = ZERO
     whole.second.met = ZERO
@@ -417,7 +419,7 @@ def pull_pair(
     a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
     at = met_pair(scene, world, found, a, b, found.share, found.toward)
     samples = touching_of(scene, world, found)
-    samples.pose = posed(scene, world, a, b, index.first, index.second, found.share, h, pair.follows)
+    samples.pose = posed(scene, world, near_pair(scene, world, found.pair), a, b, found.share)
     samples.pose.com_difference = found.com_difference
     restores = ONE
     if samples.material.instant > ZERO:

@@ -202,10 +202,10 @@ def waiting_bars(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: Fo
     bars = Waiting()
     if wp.static(not TREES):
         index = scene.pair_index[found.pair]
-        if found.first_waits > 0:
+        if found.waits > 0 and scene.body_index[index.first].row >= 0:
             bars.first_support = room.body_bars[world, index.first].support
             add_meeting(scene, room, world, index.first, bars)
-        if found.second_waits > 0:
+        if found.waits > 0 and scene.body_index[index.second].row >= 0:
             bars.second_support = room.body_bars[world, index.second].support
             add_meeting(scene, room, world, index.second, bars)
     return bars
@@ -241,8 +241,7 @@ def pull_equations(
     # When impulses take effect matters to all contact of a body: what has them wait comes last.
     for k in range(2 * n_found):
         entry = (k % n_found) * _LANES + lane
-        waits = room.found[world, entry].first_waits + room.found[world, entry].second_waits
-        if (waits > 0) == (k >= n_found):
+        if (room.found[world, entry].waits > 0) == (k >= n_found):
             found = room.found[world, entry]
             twists = twists_of_pair(scene, room, world, entry)
             waiting = waiting_bars(scene, room, world, found)
