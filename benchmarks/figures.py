@@ -10,9 +10,10 @@ with the groups of rows to show, all without any. Two other forms:
     <!-- figures: cases FILE.json FILE.json | NAME | NAME … -->
     <!-- figures: headlines -->
 
-The first has a row for each group of its files that has such names, and a column for each name. The
-second has the rows that `benchmarks/_headlines.py` lists. `python -m benchmarks.figures` rewrites all
-tables; with `--check` it changes nothing and fails where one is out of date.
+The first has a row for each group of its files that has such names, and a column for each name; of a name
+that ends in "?" a group may have no row. The second has the rows that `benchmarks/_headlines.py` lists.
+`python -m benchmarks.figures` rewrites all tables; with `--check` it changes nothing and fails where one is
+out of date.
 """
 
 import argparse
@@ -53,17 +54,19 @@ def _table(what: str) -> str:
 
 def _cases(what: str) -> str:
     files, *names = (word.strip() for word in what.split("|"))
+    optional = {name.removesuffix("?") for name in names if name.endswith("?")}
+    names = [name.removesuffix("?") for name in names]
     lines = ["| | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     for file in files.split():
         rows = _result(file)["rows"]
         for group in dict.fromkeys(row["group"] for row in rows):
             found = {row["name"]: stored_row(row) for row in rows if row["group"] == group}
-            missing = [name for name in names if name not in found]
-            if len(missing) == len(names):
+            missing = [name for name in names if name not in found and name not in optional]
+            if not found.keys() & set(names):
                 continue  # A group of other things.
             if missing:
                 raise ValueError(f"{file} must have rows {names} for {group!r}, {missing[0]!r} is not there")
-            cells = [_measured(found[name]) for name in names]
+            cells = [_measured(found[name]) if name in found else "–" for name in names]
             lines.append(f"| {group} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n\n"
 

@@ -71,3 +71,5 @@ def test_cases_are_rows(tmp_path, monkeypatch):
     assert "| | way |\n|---|---|\n| mug | 2 m |\n| cup | 4 m |" in table
     with pytest.raises(ValueError, match=r"b.json must have rows \['way', 'time'\] for 'cup', 'time' is not"):
         figures.updated(text.format("b.json").replace("| way", "| way | time"))
+    table = figures.updated(text.format("a.json b.json").replace("| way", "| way | time?"))
+    assert "| | way | time |\n|---|---|---|\n| mug | 2 m | 3 m |\n| cup | 4 m | – |" in table

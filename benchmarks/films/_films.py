@@ -12,7 +12,7 @@ from PIL import Image
 from benchmarks.films._world import AT_REST, coded, looking, Pose, walk, World
 from dano.learning import train_object
 from dano.maths import quat_exp, quat_from_matrix, quat_multiply, quat_to_matrix
-from dano.vision import Capture, Film, PosedCamera, TrainOptions, View
+from dano.vision import Capture, Film, LearnedField, PosedCamera, TrainOptions, View
 
 _SUNS = ((-0.3, -0.5, 0.8), (0.6, 0.1, 0.7), (-0.5, 0.4, 0.6), (0.2, -0.6, 0.9))
 
@@ -46,6 +46,17 @@ KINDS = {
     "engine is thrown, most of it beside the picture": Kind("engine", "throw", 2),
 }
 """Films that are drawn, by name."""
+
+
+def known(field: LearnedField | None, name: str) -> LearnedField:
+    """A field that was learned.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if field is None:
+        raise ValueError(f"the object of {name} must have a learned field, got none")
+    return field
 
 
 class Filmed(NamedTuple):
@@ -107,20 +118,45 @@ def _drawn(kind: Kind, count: int):
     return times, poses, base, frames, empty
 
 
-def _slide(count: int, kind: Kind) -> tuple[np.ndarray, list[Pose]]:
-    """At rest for two frames, pushed for two, then slowed down by friction."""
-    step, pushed, speed = 1 / _RATE, 2, 0.6
-    assert kind.friction is not None
-    force, slowing = speed / (pushed * step), 9.81 * kind.friction
-    heading = np.array([np.cos(0.3), np.sin(0.3), 0])
-    turn, rows = quat_to_matrix(quat_exp(np.array([0, 0, 0.5 + 0.1 * kind.number]))), []
+def slide(
+    count: int,
+    rate: float,
+    friction: float,
+    *,
+    pushed: int,
+    speed: float,
+    start: tuple[float, float],
+    heading: float,
+    turn: float = 0.5,
+) -> tuple[np.ndarray, list[Pose]]:
+    """At rest for two frames, pushed for some, then slowed down by friction.
+
+    Args:
+        count: Frames.
+        rate: Frames a second.
+        friction: Of the table.
+        pushed: Frames of the push.
+        speed: At its end [m/s].
+        start: Where it begins [m].
+        heading: Where it slides to [rad].
+        turn: How it is turned [rad].
+    """
+    step = 1 / rate
+    force, slowing = speed / (pushed * step), 9.81 * friction
+    along, rows = np.array([np.cos(heading), np.sin(heading), 0]), []
     for i in range(count):
         t = (i - 2) * step
         way = 0.5 * force * min(max(t, 0), pushed * step) ** 2
         later = min(max(t - pushed * step, 0), speed / slowing)
         way += speed * later - 0.5 * slowing * later**2
-        rows.append((turn, np.array([-0.08, -0.02, 0.0]) + way * heading))
+        rows.append((quat_to_matrix(quat_exp(np.array([0, 0, turn]))), np.array([*start, 0.0]) + way * along))
     return np.arange(count) * step, rows
+
+
+def _slide(count: int, kind: Kind) -> tuple[np.ndarray, list[Pose]]:
+    assert kind.friction is not None
+    turn, start = 0.5 + 0.1 * kind.number, (-0.08, -0.02)
+    return slide(count, _RATE, kind.friction, pushed=2, speed=0.6, start=start, heading=0.3, turn=turn)
 
 
 def _spin(count: int, kind: Kind) -> tuple[np.ndarray, list[Pose]]:

@@ -6,38 +6,27 @@ import sys
 import time
 import warnings
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 import dano
 from benchmarks._measure import load_average, parse_arguments, report, Row
 from benchmarks.figures import stored_row
-from benchmarks.films._films import filmed, KINDS, learned, PUSH
+from benchmarks.films._errors import error_rows, errors_of, FRAMES, friction_rows, OFF, Truth
+from benchmarks.films._films import filmed, KINDS, known, learned, PUSH
+from benchmarks.films._story import STORY, story_rows
 from benchmarks.track._cases import in_region, read_case
 from benchmarks.track._phone import without_masks
 from dano.identification import identify, Motion
-from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate, quat_to_matrix
+from dano.maths import quat_to_matrix
 from dano.scene_file import load_object
 from dano.vision import LearnedField, track, Tracked, TrackOptions
 
 _TRACKING = TrackOptions(table=0.0, views=48, turns=18, candidates=4, rays=1200)
 """For films of 280 × 210 pixels."""
 
-_ALL, _REGIONS, _OFF = "all films", "regions: all", "off by"
+_ALL, _REGIONS = "all films", "regions: all"
 """Names of rows that others are made of."""
-
-_INTERVAL = 1.96
-"""Standard errors of a 95 % interval."""
-
-
-class _Truth(NamedTuple):
-    """True poses of a film, and what is needed to compare others with them."""
-
-    position: np.ndarray  # (T, 3)
-    orientation: np.ndarray  # (T, 4)
-    middle: np.ndarray  # Of the object [m, its frame]
-    size: float  # Its longest side [m]
 
 
 def run() -> None:
@@ -48,14 +37,22 @@ def run() -> None:
     names = [*KINDS, *_rendered(arguments.rendered)] if arguments.only is None else arguments.only
     names = names[: 1 if arguments.quick else None]
     groups = [_group(name) for name in names]
-    rows = [row for row in _stored(arguments.json) if row.group not in [*groups, _ALL]]
+    again = [*groups, _ALL, *([STORY] if arguments.story else [])]
+    rows = [row for row in _stored(arguments.json) if row.group not in again]
     for name, group in zip(names, groups, strict=True):
-        for row in _one(name, group, arguments):
-            value = "" if row.value is None else f"{row.value:.3g} {row.unit}"
-            print(f"{row.group}: {row.name} {value}  {row.note}", file=sys.stderr, flush=True)
-            rows.append(row)
+        rows += _told(_one(name, group, arguments))
+    if arguments.story:
+        rows += _told(story_rows(arguments.folder / "story"))
     rows += _together(rows)
     report("films", rows, {"quick": arguments.quick, "options": str(_TRACKING)}, load, arguments.json)
+
+
+def _told(rows: list[Row]) -> list[Row]:
+    """Rows, printed at once: all films together take half an hour."""
+    for row in rows:
+        value = "" if row.value is None else f"{row.value:.3g} {row.unit}"
+        print(f"{row.group}: {row.name} {value}  {row.note}", file=sys.stderr, flush=True)
+    return rows
 
 
 def _stored(file: Path | None) -> list[Row]:
@@ -69,9 +66,9 @@ def _together(rows: list[Row]) -> list[Row]:
     """How many regions and intervals hold the truth, of all films."""
     named = {(row.group, row.name): row.value or 0.0 for row in rows}
     groups = [group for group, name in named if name == _REGIONS]
-    frames = np.array([named[group, "frames"] for group in groups])
+    frames = np.array([named[group, FRAMES] for group in groups])
     held = np.array([named[group, _REGIONS] for group in groups])
-    off = [row for row in rows if row.name == _OFF]
+    off = [row for row in rows if row.name == OFF]
     share = float(np.average(held, weights=frames)) if frames.sum() else None
     count = sum(row.verdict == "pass" for row in off)
     return [
@@ -82,6 +79,11 @@ def _together(rows: list[Row]) -> list[Row]:
 
 def _options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="DIR", help="where drawn films and objects are kept")
+    parser.add_argument(
+        "--story",
+        action="store_true",
+        help="`dano film` from an empty folder, twice, too: half an hour of CPU",
+    )
     parser.add_argument("--rendered", type=Path, metavar="DIR", help="what assets/render_videos.py wrote")
     parser.add_argument(
         "--only", nargs="*", metavar="FILM", help="some of the films; of the others, rows of --json are kept"
@@ -102,16 +104,15 @@ def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
     if kind is None:
         case = read_case(arguments.rendered / name)
         film, camera, empty = without_masks(case.film), case.camera, case.background
-        field = _known(case.field, name)
-        truth = _Truth(case.position, case.orientation, case.middle, case.size)
+        field = known(case.field, name)
+        truth = Truth(case.position, case.orientation, case.middle, case.size)
         options = case.options("object")
     else:
         source = learned(folder, kind.toy, quick=arguments.quick)
         drawn = filmed(folder, name, quick=arguments.quick)
         film, camera, empty = drawn.film, drawn.camera, drawn.empty
-        field = _known(LearnedField.of_object(source), name)
-        lower, upper = np.asarray(field.solid.solid_bounds, np.float64)
-        truth = _Truth(drawn.position, drawn.orientation, 0.5 * (lower + upper), float((upper - lower).max()))
+        field = known(LearnedField.of_object(source), name)
+        truth = Truth.of(field, drawn.position, drawn.orientation)
         options = _TRACKING
     began = time.process_time()
     found = track(film, field, camera, options, background=empty)
@@ -121,22 +122,7 @@ def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
     if kind is None or kind.friction is None or source is None:
         return rows
     value, error = _friction(source, found)
-    off = abs(value - kind.friction) / error
-    rows.append(Row(group, "friction", value, "", note=f"± {error:.4f}, truth {kind.friction}"))
-    rows += [Row(group, "error", error, ""), Row(group, "truth", kind.friction, "")]
-    rows.append(Row(group, _OFF, off, "σ", _INTERVAL))
-    return rows
-
-
-def _known(field: LearnedField | None, name: str) -> LearnedField:
-    """A field that was learned.
-
-    Raises:
-        ValueError: If there is none.
-    """
-    if field is None:
-        raise ValueError(f"the object of {name} must have a learned field, got none")
-    return field
+    return [*rows, *friction_rows(group, value, error, kind.friction)]
 
 
 def _friction(source: Path, found: Tracked) -> tuple[float, float]:
@@ -155,43 +141,22 @@ def _friction(source: Path, found: Tracked) -> tuple[float, float]:
     return float(fit.values["mu"]), max(1.0, float(fit.errors.rms)) * float(fit.standard_errors["mu"])
 
 
-def _of_poses(group: str, truth: _Truth, found: Tracked) -> list[Row]:
-    """Errors of the middle and of the turn, with and without what all frames share."""
+def _of_poses(group: str, truth: Truth, found: Tracked) -> list[Row]:
+    """Errors of the middle and of the turn, with and without what all frames share, and regions."""
     ok = np.isfinite(found.position[:, 0])
     n, known = len(ok), int(ok.sum())
-    frames = Row(group, "frames", known, "", note=f"of {n}: {', '.join(sorted(set(found.status)))}")
+    frames = Row(group, FRAMES, known, "", note=f"of {n}: {', '.join(sorted(set(found.status)))}")
     if not known:
         return [frames]
-    position, orientation = found.position[ok], found.orientation[ok]
-    turns = quat_log(quat_multiply(quat_conjugate(orientation), truth.orientation[ok]))
-    rotation, arm = quat_to_matrix(orientation), np.broadcast_to(truth.middle, position.shape)
-    beside = truth.position[ok] + quat_rotate(truth.orientation[ok], arm)
-    beside = beside - position - quat_rotate(orientation, arm)
-    errors = np.concatenate([truth.position[ok] - position, turns], axis=1)
-    # In the object's frame what is wrong with it is one shift and one turn.
-    own = np.einsum("nji,nj->ni", rotation, beside)
-    shift, turn = own.mean(axis=0), turns.mean(axis=0)
-    left = np.concatenate([np.einsum("nij,nj->ni", rotation, own - shift), turns - turn], axis=1)
+    errors = errors_of(truth, found.position, found.orientation)
     carried = np.tile(np.eye(6), (known, 1, 1))
-    carried[:, :3, 3:] = -rotation @ np.cross(np.eye(3), truth.middle)
+    carried[:, :3, 3:] = -quat_to_matrix(found.orientation[ok]) @ np.cross(np.eye(3), truth.middle)
     around = carried @ found.own[ok] @ np.swapaxes(carried, 1, 2)
-    alone = in_region(_squares(left, around))
-    whole = in_region(_squares(errors, found.covariance[ok]))
-    away = 100 * np.linalg.norm(beside, axis=1) / truth.size
-    rest = 100 * np.linalg.norm(left[:, :3], axis=1) / truth.size
-
-    def angle(vectors: np.ndarray) -> float:
-        return float(np.degrees(np.median(np.linalg.norm(vectors, axis=-1))))
-
+    alone = in_region(_squares(errors.left, around))
+    whole = in_region(_squares(errors.of_frame, found.covariance[ok]))
     return [
         frames,
-        Row(group, "position, median", float(np.median(away)), "%"),
-        Row(group, "position, largest", float(away.max()), "%"),
-        Row(group, "turn", angle(turns), "°"),
-        Row(group, "shared", 100 * float(np.linalg.norm(shift)) / truth.size, "%"),
-        Row(group, "shared turn", angle(turn[None]), "°"),
-        Row(group, "own", float(np.median(rest)), "%"),
-        Row(group, "own turn", angle(left[:, 3:]), "°"),
+        *error_rows(group, errors),
         Row(group, "regions: own", 100 * float(alone.mean()), "%"),
         Row(group, _REGIONS, 100 * float(whole.mean()), "%"),
     ]

@@ -15,7 +15,8 @@ from benchmarks.films._paper import linear, newspaper, PAPER, pattern, SIDE, TEX
 from dano.maths import quat_exp, quat_to_matrix
 from dano.vision import PosedCamera
 
-_TAG, _TAG_SIDE, _TAG_AT = 3, 0.05, np.array([0.105, -0.045])
+_TAG, TAG_SIDE, TAG_AT = 3, 0.05, np.array([0.105, -0.045])
+"""Number of the marker, its side [m], and where its middle lies [m]."""
 
 _PALE = 0.15
 """Share of a toy that is as pale as the paper."""
@@ -92,6 +93,14 @@ class World:
             cv2.GaussianBlur(pattern(texture + 2), (0, 0), 8),
         )
         self._level = np.quantile(self._broad, 1 - _PALE)
+
+    def volume(self) -> float:
+        """Of the toy [m³], to some 0.1 %."""
+        axes = [np.linspace(a, b, 201) for a, b in zip(self._low, self._high, strict=True)]
+        middles = [0.5 * (axis[1:] + axis[:-1]) for axis in axes]
+        points = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
+        cell = float(np.prod([axis[1] - axis[0] for axis in axes]))
+        return cell * int(np.sum(self._distance(points) < 0))
 
     def light(
         self,
@@ -170,10 +179,10 @@ def _at(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _with_marker(page: np.ndarray) -> np.ndarray:
     page, scale = page.copy(), TEXELS / SIDE
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    side = round(_TAG_SIDE * scale)
+    side = round(TAG_SIDE * scale)
     sheet = np.pad(cv2.aruco.generateImageMarker(family, _TAG, side), side // 5, constant_values=255) / 255
-    column = round(TEXELS / 2 + _TAG_AT[0] * scale - len(sheet) / 2)
-    row = round(TEXELS / 2 - _TAG_AT[1] * scale - len(sheet) / 2)
+    column = round(TEXELS / 2 + TAG_AT[0] * scale - len(sheet) / 2)
+    row = round(TEXELS / 2 - TAG_AT[1] * scale - len(sheet) / 2)
     page[row : row + len(sheet), column : column + len(sheet)] = (0.05 + 0.9 * sheet)[..., None]
     return page
 

@@ -1,6 +1,7 @@
 """What the pixels of a film show: the object, the place in sun and shadow, or something else."""
 
 import numpy as np
+import pytest
 from scipy import ndimage
 
 from dano.vision.drawing import GAMMA
@@ -10,6 +11,7 @@ from dano.vision.tracking._segments import (
     overlap,
     Palette,
     Place,
+    SHADES,
     uncommon,
     unlike_place,
 )
@@ -61,6 +63,23 @@ def test_what_looks_like_a_shadow_is_the_object_if_it_has_its_colours():
     palette = Palette((look + 0.03 * rng.normal(size=look.shape))[truth].clip(0, 1))
     assert overlap(unlike_place(image, known), truth.astype(float)) < 0.75
     assert overlap(unlike_place(image, known, palette), truth.astype(float)) > 0.9
+
+
+@pytest.mark.parametrize("shade", [0.93, 0.775, 0.63, 0.45])
+def test_shadows_of_any_depth_are_no_object(shade):
+    """On pale paper, in a sharp film, to an object that is in part as pale as the paper."""
+    rng = np.random.default_rng(5)
+    place = rng.choice([0.84, 0.5], (80, 100, 1), p=(0.7, 0.3)) * np.array([1.0, 0.97, 0.9])
+    y, x = np.mgrid[:80, :100]
+    truth = (y > 20) & (y < 55) & (x > 30) & (x < 75)
+    shadow = (y > 35) & (y < 60) & (x > 12) & (x < 50)
+    pale = rng.uniform(size=truth.shape) < 0.15
+    look = np.where(pale[..., None], [0.84, 0.81, 0.75], [0.6, 0.1, 0.2])
+    image = np.where(truth[..., None], look, np.where(shadow[..., None], shade, 1.0) * place)
+    image = image + 0.01 * rng.normal(size=image.shape)
+    empty = np.rint(255 * np.clip(place + 0.01 * rng.normal(size=place.shape), 0, 1)).astype(np.uint8)
+    palette = Palette(np.concatenate([k * look[truth] for k in SHADES]))
+    assert overlap(unlike_place(image, Place(place, [empty] * 2), palette), truth.astype(float)) > 0.95
 
 
 def test_a_table_is_bright_where_the_object_passes_with_its_shadow():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dano.vision.trajectory import Poses, Scenery, smoothed, Solid, solid_of
+from dano.vision.trajectory import crossings, Poses, Scenery, smoothed, Solid, solid_of
 
 FRAMES = 24
 SIDES = np.array([0.10, 0.06, 0.04])
@@ -198,6 +198,37 @@ def test_what_all_frames_are_off_alike_is_told_by_a_table(box, alike):
         assert away[:, 1].max() < 0.3 * abs(bias[1])
     else:
         assert np.degrees(away[:, 3]).max() > 0.8
+
+
+@pytest.mark.parametrize("below", [0.0, 1.0])
+def test_what_a_table_cut_off_is_a_face_that_is_exactly_flat(below):
+    """A ball with a wavy foot in a grid; with a table, what lies below it is cut off."""
+    axis = np.linspace(-1.1, 1.1, 41)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    foot = -0.6 + 0.02 * np.cos(3 * x) * np.cos(2 * y + 1) - z
+    values = np.maximum(np.sqrt(x**2 + y**2 + z**2) - 1, np.maximum(foot, -0.55 - z - below))
+    points = axis[0] + (axis[1] - axis[0]) * crossings(values)
+    faces = solid_of(points, np.array([0, 0, -0.1])).faces
+    lowest = min(faces, key=lambda face: face.down[2])
+    assert lowest.down[2] < -0.99
+    assert lowest.cut == (below == 0.0)
+    assert not any(face.cut for face in faces if face is not lowest)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_foot_that_a_table_cut_off_holds_against_frames_that_see_it_tilted(box, cut):
+    """All frames are very sure of a tilt of 2°, as with a learned object whose corners are filled."""
+    times = np.arange(FRAMES) / 30
+    position = np.stack([0.3 * times - 0.2 * times**2, 0.1 * times, np.full(FRAMES, 0.2)], axis=1)
+    orientation = Rotation.from_rotvec(np.outer(np.full(FRAMES, 0.4), [0, 0, 1.0]))
+    given = seen(position, orientation, np.tile(0.1 * np.diag(SURE), (FRAMES, 1, 1)), 6)
+    tilted = Rotation.from_quat(np.roll(given.orientation, -1, axis=1)) * Rotation.from_rotvec([0.035, 0, 0])
+    given = given._replace(orientation=np.roll(tilted.as_quat(), 1, axis=1))
+    learned = box._replace(faces=tuple(face._replace(cut=cut) for face in box.faces))
+    found = smoothed(times, given, Scenery(learned, NOWHERE, 0.2, alike=4.0))
+    away = np.degrees(np.abs(off(found.poses, position, orientation)[:, 3]))
+    assert found.supported.all()
+    assert away.max() < 0.3 if cut else away.min() > 1
 
 
 def test_a_face_that_is_far_more_tilted_than_a_true_one_says_no_height(box):

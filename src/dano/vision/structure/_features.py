@@ -104,6 +104,7 @@ def find_matches(
                 lambda share=share: progress("looking for points", share),
             )
             done += len(chunk)
+        number_by_name(database, [names[i] for i in members])
     pairs = _pairs(len(names), ordered)
     for start in range(0, len(pairs), _PAIRS_CHUNK):
         chunk = [(names[a], names[b]) for a, b in pairs[start : start + _PAIRS_CHUNK]]
@@ -195,6 +196,34 @@ def _extract(
         device=library.Device.cpu,
         poll=poll,
     )
+
+
+def number_by_name(database: Path, names: list[str]) -> None:
+    """Give pictures of one camera numbers in the order of their names.
+
+    Threads number them as they end. Their order decides in which order points and cameras are summed, and
+    the same photographs would not give the same cameras twice.
+    """
+    with colmap().Database.open(database) as file:
+        images = [file.read_image_with_name(name) for name in sorted(names)]
+        numbers = sorted(image.image_id for image in images)
+        if [image.image_id for image in images] == numbers:
+            return
+        others = {image.image_id for image in file.read_all_images()} - set(numbers)
+        found = {key: (file.read_keypoints(key), file.read_descriptors(key)) for key in [*numbers, *others]}
+        file.clear_keypoints()
+        file.clear_descriptors()
+        kept = {key: found[key] for key in others}
+        kept |= {number: found[image.image_id] for number, image in zip(numbers, images, strict=True)}
+        for number, (points, descriptors) in kept.items():
+            file.write_keypoints(number, points)
+            file.write_descriptors(number, descriptors)
+        # No two may have one name in between.
+        for rename in ("renamed {}".format, str):
+            for number, name in zip(numbers, sorted(names), strict=True):
+                image = file.read_image(number)
+                image.name = rename(name)
+                file.update_image(image)
 
 
 def _camera_of(database: Path, name: str) -> int:

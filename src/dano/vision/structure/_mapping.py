@@ -20,6 +20,9 @@ from dano.vision.structure._options import PoseOptions
 _FEWEST_PICTURES = 3
 """Smallest model that is reported."""
 
+_NEVER = 2**31 - 1
+"""Residuals from which a bundle adjustment takes several threads."""
+
 _THRESHOLDS: tuple[dict[str, int | float], ...] = (
     # Common points to begin with, points and their share to add a picture with.
     {"init_min_num_inliers": 40, "abs_pose_min_num_inliers": 12, "abs_pose_min_inlier_ratio": 0.1},
@@ -112,6 +115,9 @@ def _attempt(
     settings = library.IncrementalPipelineOptions()
     settings.random_seed = options.seed
     settings.extract_colors = False
+    # Threads sum in different orders: what follows would not be the same twice.
+    settings.num_threads = 1
+    settings.ba_min_num_residuals_for_cpu_multi_threading = _NEVER
     settings.min_model_size = _FEWEST_PICTURES
     settings.min_num_matches = FEWEST_MATCHES
     settings.ba_refine_focal_length = options.focal is None
@@ -226,6 +232,7 @@ def _adjuster(reconstruction: Any, *, extra: bool) -> Any:
     library = colmap()
     options = library.BundleAdjustmentOptions()
     options.refine_extra_params = extra
+    options.ceres.min_num_residuals_for_cpu_multi_threading = _NEVER
     options.print_summary = False
     settings = library.BundleAdjustmentConfig()
     for key in reconstruction.reg_image_ids():

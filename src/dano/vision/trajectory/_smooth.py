@@ -321,13 +321,15 @@ class _Problem:
         """How far a learned object may differ from the true one; a face as by Student's distribution.
 
         Nobody photographs what an object stands on. If frames say that a face is far more tilted than a true
-        one may be, then its height is not believed either.
+        one may be, then its height is not believed either. What a known table cut off is flat, and was there.
         """
         known = 1 / self._doubts
         faces = known[: 3 * len(self._runs)].reshape(-1, 3)
         square = np.sum((faces * shared[: faces.size].reshape(-1, 3)) ** 2, axis=1)
-        weight, cost = _by_student(square, 3)
-        self._cost += cost + 0.5 * float(np.sum((known * shared)[faces.size :] ** 2))
+        cut = np.array([run.face.cut for run in self._runs], bool)
+        weight, cost = _by_student(np.where(cut, 0, square), 3)
+        weight[cut] = 1.0
+        self._cost += cost + 0.5 * float(square[cut].sum() + np.sum((known * shared)[faces.size :] ** 2))
         known[: faces.size] *= np.repeat(np.sqrt(weight), 3)
         rows = np.arange(len(shared))
         return _Part(known, rows, width - len(shared) + rows, known * shared)

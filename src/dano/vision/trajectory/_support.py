@@ -16,12 +16,19 @@ _STEADY = 0.05
 """Share of the size by which the centre of mass must lie within the foot of a face: less is a balance. The
 edges of a learned box are rounded, by 0.02 or so."""
 
+_PLANE = 1e-6
+"""Distance from a plane up to which points lie on it, as a share of the size: rounding."""
+
+_MANY = 24
+"""Points on the plane of a face from which that is no chance: three are on each face of a hull."""
+
 
 class Face(NamedTuple):
     """A way to lie."""
 
     down: Float[np.ndarray, "3"]  # Unit normal of the face, outwards [F]
     point: Float[np.ndarray, "3"]  # On the face, below the centre of mass [m, F]
+    cut: bool = False  # Whether it is exactly flat: a known table, on which it stood, cut it off
 
 
 class Solid(NamedTuple):
@@ -58,7 +65,8 @@ def solid_of(points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]) -> S
         # The foot may lie on an edge between two triangles of one face.
         new = all(normal[i] @ face.down < 1 - 1e-9 for face in faces)
         if new and _margin(corners, normal[i], foot[i], height[i]) > _STEADY * size:
-            faces.append(Face(normal[i], foot[i]))
+            on = np.abs((points - foot[i]) @ normal[i]) < _PLANE * size
+            faces.append(Face(normal[i], foot[i], bool(on.sum() >= _MANY)))
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     return Solid(size, middle, np.asarray(com, np.float64), corners, tuple(faces))
 
