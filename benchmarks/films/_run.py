@@ -14,13 +14,14 @@ from benchmarks._measure import load_average, parse_arguments, report, Row
 from benchmarks.figures import stored_row
 from benchmarks.films._errors import error_rows, errors_of, FRAMES, friction_rows, OFF, Truth
 from benchmarks.films._films import filmed, KINDS, known, learned, PUSH
+from benchmarks.films._pictures import draw_poses
 from benchmarks.films._story import STORY, story_rows
 from benchmarks.track._cases import in_region, read_case
 from benchmarks.track._phone import without_masks
 from dano.identification import identify, Motion
 from dano.maths import quat_to_matrix
 from dano.scene_file import load_object
-from dano.vision import LearnedField, track, Tracked, TrackOptions
+from dano.vision import LearnedField, steady_film, track, Tracked, TrackOptions
 
 _TRACKING = TrackOptions(table=0.0, views=48, turns=18, candidates=4, rays=1200)
 """For films of 280 × 210 pixels."""
@@ -86,6 +87,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--rendered", type=Path, metavar="DIR", help="what assets/render_videos.py wrote")
     parser.add_argument(
+        "--pictures",
+        type=Path,
+        metavar="DIR",
+        help="where to draw the worst frame of each film, with the outlines as found (red) and true (green)",
+    )
+    parser.add_argument(
         "--only", nargs="*", metavar="FILM", help="some of the films; of the others, rows of --json are kept"
     )
 
@@ -118,6 +125,12 @@ def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
     found = track(film, field, camera, options, background=empty)
     seconds = (time.process_time() - began) / len(film.times)
     rows = _of_poses(group, truth, found)
+    if arguments.pictures is not None and found.n_tracked:
+        arguments.pictures.mkdir(parents=True, exist_ok=True)
+        poses, true = (found.position, found.orientation), (truth.position, truth.orientation)
+        worst = int(np.flatnonzero(np.isfinite(poses[0][:, 0]))[np.argmax(errors_of(truth, *poses).beside)])
+        steady, file = steady_film(film, camera, empty), arguments.pictures / f"{name}.png"
+        draw_poses(file, worst, steady, field, camera, poses, true)
     rows.append(Row(group, "CPU a frame", seconds, "s", note="with compilation and the start"))
     if kind is None or kind.friction is None or source is None:
         return rows

@@ -15,6 +15,7 @@ from dano.maths import quat_conjugate, quat_exp, quat_log, quat_multiply
 from dano.vision import adjust_poses, Light, track, TrackOptions
 from dano.vision.drawing import GAMMA
 from dano.vision.tracking._placement import Placement
+from dano.vision.tracking._refine import Refined
 from dano.vision.tracking._segments import moved_edge, overlap
 from dano.vision.tracking._subject import Subject
 from dano.vision.tracking._walk import Walk
@@ -119,6 +120,19 @@ def test_frames_in_which_it_lies_still_share_one_pose(bunny, camera, filmed):
         assert np.linalg.norm(turn_of(found.orientation[2], q)) < 2e-3
     shift, _ = errors(found, position[rows], orientation[rows], slice(None))
     assert np.median(shift) < 0.02
+
+
+def test_an_error_of_one_pose_is_no_velocity_where_nothing_moves(bunny, camera, filmed):
+    """It rests in frames 0 and 1, whose poses are wrong along the line of sight; then it moves."""
+    position, orientation, frames, masks = filmed
+    rows, whole, nothing = [0, 0, 1, 2], (slice(0, SIZE[1]), slice(0, SIZE[0])), np.eye(6)
+    walk = Walk(film_of([frames[i] for i in rows], [masks[i] for i in rows]), bunny, camera, ROUGH, None)
+    wrong = position[0] + 0.05 * (camera.position - position[0])
+    for i, place in enumerate([wrong, wrong, position[1]]):
+        known = Placement(place, orientation[rows[i]])
+        walk._found[i] = Refined(known, 0.0, 1.0, 0.0, nothing, nothing, whole, masks[rows[i]])
+    np.testing.assert_array_equal(walk._carried(2, 1, 0).position, wrong)
+    np.testing.assert_allclose(walk._carried(1, 2, 3).position, 2 * position[1] - wrong, atol=1e-9)
 
 
 def turn_of(p, q):

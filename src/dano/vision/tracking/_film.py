@@ -26,8 +26,14 @@ _UNEVEN = 0.2
 _FLOW_BLUR = 1.0
 """Standard deviation of the filter of pictures whose displacement is measured [pixels]."""
 
+_CORRELATED = 4 * np.pi * _FLOW_BLUR**2
+"""Pixels with one error after that filter."""
+
 _UNMOVED = 0.15
 """Displacement up to which a thing lies still [pixels]: a film of it is exact to a few hundredths."""
+
+_UNSURE = 0.3
+"""Displacement by noise alone up to which it is known how large that is (convention: twice as much)."""
 
 
 class Film(NamedTuple):
@@ -115,8 +121,15 @@ class Film(NamedTuple):
         )
         away = (first - second)[region[window]]
         found = np.linalg.lstsq(flow, away, rcond=None)[0]
-        reach = float(np.hypot(x, y).max())
-        return bool(np.hypot(*found[:2]) + reach * np.hypot(*found[2:4]) < _UNMOVED)
+        reach = np.hypot(x, y).max()
+        moved = np.array([np.sum(found[:2] ** 2), reach**2 * np.sum(found[2:4] ** 2)])
+        if np.sqrt(moved).sum() < _UNMOVED:
+            return True
+        # Noise alone displaces small things by so much, if it does not hide all.
+        spread = _CORRELATED * np.var(away - flow @ found) * np.diagonal(np.linalg.pinv(flow.T @ flow))
+        noise = np.array([np.sum(spread[:2]), reach**2 * np.sum(spread[2:4])])
+        left = np.sqrt(np.maximum(moved - noise, 0)).sum()
+        return bool(np.sqrt(noise).sum() < _UNSURE and left < _UNMOVED)
 
     def quiet(self, count: int, worse: Sequence[bool] | None = None) -> list[int]:
         """Frames in which little moves, spread over the film, the quietest one first.

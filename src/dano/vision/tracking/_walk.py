@@ -202,7 +202,13 @@ class Walk:
         return best[1] if best[0] > _CAUGHT else last
 
     def _carried(self, j: int, k: int, i: int) -> Placement:
-        """The pose in frame i at the constant velocity that leads from frame j to k."""
+        """The pose in frame i at the constant velocity that leads from frame j to k, or at rest.
+
+        Where nothing moves, by the pictures, what two poses are off by is no velocity.
+        """
+        near = min(j, k, key=lambda one: abs(one - i))
+        if self._rests(i, near):
+            return self._place(near)
         times = self._film.times
         return self._place(j).led_to(self._place(k), (times[i] - times[k]) / (times[k] - times[j]))
 
@@ -396,13 +402,19 @@ class Walk:
                 found = self._fine(i, found.place, own) or found
         return Start(found, own if own.known else light, score(found))
 
+    def _rests(self, i: int, j: int) -> bool:
+        """Whether the object, known in frame j, lies still between it and frame i, by their pictures."""
+        known = [one for one in (self._found[j], self._found[i]) if one is not None]
+        shape = self._film.images[i].shape[:2]
+        return self._film.is_still(j, i, np.any([region_of(one, shape) for one in known], axis=0))
+
     def _unmoved(self, i: int) -> Refined | None:
         """The pose of the frame before, if the object lies still between both; None if it moves."""
         last = self._path[-1] if self._path else i
         before = self._found[last] if abs(i - last) == 1 else None
         if before is None or self._masking.hidden(i, before.window) > 1 - BLIND:
             return None
-        if not self._film.is_still(last, i, region_of(before, self._film.images[i].shape[:2])):
+        if not self._rests(i, last):
             return None
         found = self._fine(i, dataclasses.replace(before.place, drift=None), self._light, 1)
         return found if found is not None and self._is_it(found) else None
