@@ -165,6 +165,18 @@ def test_what_lies_still_is_told_from_what_creeps(shift, gain, still):
     assert not film.is_still(0, 1, np.zeros_like(region))
 
 
+def test_frames_that_were_turned_back_are_less_exact():
+    rng = np.random.default_rng(2)
+    large = 255 * ndimage.gaussian_filter(rng.uniform(0, 1, (60, 80, 3)), (1.5, 1.5, 0))
+    images = [np.rint(ndimage.shift(large, (0, x, 0))).astype(np.uint8) for x in (0.0, 0.2)]
+    film = Film(("0", "1"), np.array([0, 1 / 30]), images, [None] * 2, [None] * 2, 1, ())
+    region = np.zeros((60, 80), bool)
+    region[15:45, 20:60] = True
+    assert not film.is_still(0, 1, region)
+    assert not film._replace(turns=np.tile([1.0, 0, 0, 0], (2, 1))).is_still(0, 1, region)
+    assert film._replace(turns=np.array([[1.0, 0, 0, 0], [1.0, 1e-3, 0, 0]])).is_still(0, 1, region)
+
+
 def test_noise_does_not_move_a_small_thing():
     """One of 20 × 30 pixels in noise of 2 %: shown twice at one place, and 0.4 pixels aside."""
     region = np.zeros((60, 80), bool)

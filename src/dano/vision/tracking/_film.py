@@ -32,6 +32,9 @@ _CORRELATED = 4 * np.pi * _FLOW_BLUR**2
 _UNMOVED = 0.15
 """Displacement up to which a thing lies still [pixels]: a film of it is exact to a few hundredths."""
 
+_TURNED = 0.1
+"""The same, more, where the camera was turned between two frames: that is known to so much [pixels]."""
+
 _UNSURE = 0.3
 """Displacement by noise alone up to which it is known how large that is (convention: twice as much)."""
 
@@ -123,13 +126,15 @@ class Film(NamedTuple):
         found = np.linalg.lstsq(flow, away, rcond=None)[0]
         reach = np.hypot(x, y).max()
         moved = np.array([np.sum(found[:2] ** 2), reach**2 * np.sum(found[2:4] ** 2)])
-        if np.sqrt(moved).sum() < _UNMOVED:
+        turned = self.turns is not None and not np.array_equal(self.turns[i], self.turns[j])
+        most = _UNMOVED + (_TURNED if turned else 0)
+        if np.sqrt(moved).sum() < most:
             return True
         # Noise alone displaces small things by so much, if it does not hide all.
         spread = _CORRELATED * np.var(away - flow @ found) * np.diagonal(np.linalg.pinv(flow.T @ flow))
         noise = np.array([np.sum(spread[:2]), reach**2 * np.sum(spread[2:4])])
         left = np.sqrt(np.maximum(moved - noise, 0)).sum()
-        return bool(np.sqrt(noise).sum() < _UNSURE and left < _UNMOVED)
+        return bool(np.sqrt(noise).sum() < _UNSURE and left < most)
 
     def quiet(self, count: int, worse: Sequence[bool] | None = None) -> list[int]:
         """Frames in which little moves, spread over the film, the quietest one first.
