@@ -677,8 +677,7 @@ def at_one_moment(side, other, bodies):
     """A side of a pair that moves, with impulses that take effect when those of the other one do.
 
     The side that meets first says when, or that they do not wait. The other takes part if it has met by then,
-    too, but for δ, or else in the next step, unless the bodies rest on it: then impulses act from the start of
-    the step.
+    too, but for δ, or else in the next step, unless the bodies rest on it: then impulses act from the start.
     """
     if not (side.kappa > 0 and other.kappa > 0):
         return side
