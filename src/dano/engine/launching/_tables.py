@@ -26,9 +26,9 @@ _THIN = 0.25
 # Momentum that the damper of an impact passes on, see `dano.physics.impacts.Impact`: half the size over the
 # depth of the impact, within bounds. Where that is shallow, what has sunk in has to stop all of what comes.
 _SOFTEST, _HARDEST = 100.0, 1e4
-# Another part of a body, whose impact is left to the next step, gets in by at most this share of the size. It is
-# less where both bodies move: there a third one may keep what is left from waiting, and deep contact without
-# an impact takes many passes (64 boxes that fall: 37 instead of 46).
+# Another part of a body, whose impact is left to the next step, gets in by at most this share of the size.
+# It is less where both bodies move: there a third one may keep what is left from waiting, and deep contact
+# without an impact takes many passes (64 boxes that fall: 37 instead of 46).
 _DEEPEST, _DEEPEST_OF_TWO = 0.04, 0.01
 _STRUCTURES = "dano.engine.kernels.tables"
 # How samples turn with their body: see `dano.physics.pairs`.
