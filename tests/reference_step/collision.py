@@ -233,7 +233,11 @@ def depths_of(scene, side):
     thin = 0.25 * thickness
     delta = min(side.law.delta, thin)
     both_move = not (scene.bodies[side.i].fixed or scene.bodies[side.j].fixed)
-    return delta, max(delta, min(0.01 * size, thin)), delta if both_move else min(0.04 * size, thin)
+    return (
+        delta,
+        max(delta, min(0.01 * size, thin)),
+        max(delta, min((0.01 if both_move else 0.04) * size, thin)),
+    )
 
 
 class Meeting(NamedTuple):
@@ -245,6 +249,7 @@ class Meeting(NamedTuple):
     falls: bool = False
     support: np.ndarray = np.zeros(6)
     left_out: float = 0.0
+    waits: bool = True
 
 
 def meetings(scene, bodies, side):
@@ -257,6 +262,9 @@ def meetings(scene, bodies, side):
     raw, bodies = bodies, bodies.falling(held_of(scene, bodies, side))
     since = 0.0 if scene.joints else -1.0
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
+    if not is_alone(scene, bodies, side) and share <= -1:
+        since = 0.0
+        share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
     falls = nears(scene, bodies, side, delta, slow)
     support, left_out = np.zeros(6), 0.0
     if is_alone(scene, bodies, side) and share < 1 and falls:
@@ -268,7 +276,10 @@ def meetings(scene, bodies, side):
             held = bodies.supported(on_bodies(bodies, side.i, side.j, support))
             share = share_at(scene, held, side, delta + 2 * depth, bodies.h * slow, slow, since)
             falls = nears(scene, held, side, delta, slow)
-    return Meeting(share, bool(share < 1), falls=falls, support=support, left_out=left_out), lasting
+    hitting = Meeting(
+        share, bool(share < 1), falls=falls, support=support, left_out=left_out, waits=since < 0
+    )
+    return hitting, lasting
 
 
 def on_bodies(bodies, i, j, impulse):
@@ -552,7 +563,7 @@ def listed(scene, bodies, side, met):
     beta, stiffness = 0.0, 0.0
     if not met.lasts:
         beta, stiffness = impact(bodies, side, arm, normal, area * weight, near_load, approach)
-    delays, turns = beta * (met.hits and not scene.joints), (np.zeros((3, 3)), np.zeros(3))
+    delays, turns = beta * (met.hits and met.waits and not scene.joints), (np.zeros((3, 3)), np.zeros(3))
     if delays > 0 and is_alone(scene, bodies, side):
         load = area * weight / (area * weight).sum()
         turns = turns_after(scene, bodies, side, share, load @ arm, load @ normal)
@@ -665,15 +676,15 @@ def halved(found, bodies):
 def at_one_moment(side, other, bodies):
     """A side of a pair that moves, with impulses that take effect when those of the other one do.
 
-    The side that meets first says when. The other takes part if it has met by then, too, but for δ, or else
-    in the next step, unless the bodies rest on it: then impulses act from the start of the step.
+    The side that meets first says when, or that they do not wait. The other takes part if it has met by then,
+    too, but for δ, or else in the next step, unless the bodies rest on it: then impulses act from the start.
     """
     if not (side.kappa > 0 and other.kappa > 0):
         return side
     earlier, later = sorted((side, other), key=lambda points: (points.share, points[:2]))
     until = max(earlier.delays * earlier.share, 0)
     delays = until / side.share if until else 0.0
-    if (later.share - earlier.share) * bodies.h * later.nearing > later.delta:
+    if earlier.delays and (later.share - earlier.share) * bodies.h * later.nearing > later.delta:
         if np.any(later.depth > 0):
             delays = 0.0
         elif side is later:
@@ -685,28 +696,30 @@ def at_one_moment(side, other, bodies):
 
 
 def together(bodies, found):
-    """Sides with impacts: impulses on bodies that have one with one other, and else only lie, wait."""
+    """Sides with impacts: impulses wait where bodies have one with one other, and else lie on fixed ones."""
     if not any(points.kappa > 0 for points in found):
         return found
     partners = [set() for _ in bodies.mass]
     found = [points._replace(holds=holds(bodies, points)) for points in found]
     for points in found:
-        if points.kappa > 0 or not is_quiet(bodies, points):
-            partners[points.first].add(points.second)
-            partners[points.second].add(points.first)
+        on_moving = points.holds and all(bodies.moves[list(points[:2])])
+        if points.kappa > 0 or not is_quiet(bodies, points) or on_moving:
+            # Who lies on one that moves has no partner.
+            partners[points.first] |= {points.second, -1} if on_moving else {points.second}
+            partners[points.second] |= {points.first, -1} if on_moving else {points.first}
     held = {k for points in found if points.holds for k in points[:2]}
 
     def waiting(points):
         if not points.delays:
             return points
         carried = held if np.any(points.support) else set()
-        waits = tuple(
-            bool(bodies.moves[k]) and partners[k] == {other} and k not in carried
+        waits = all(
+            not bodies.moves[k] or (partners[k] == {other} and k not in carried)
             for k, other in (points[:2], points[1::-1])
         )
-        if not any(waits):
+        if not waits:
             return points._replace(delays=0.0, way=max(points.share, 0.0))
-        return points._replace(waits=waits)
+        return points._replace(waits=tuple(bool(bodies.moves[k]) for k in points[:2]))
 
     found = [waiting(points) for points in found]
     until = {k: when_met(found, k)[0] for points in found for k in points[:2]}
