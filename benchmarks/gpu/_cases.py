@@ -1,9 +1,7 @@
 """Scenes whose rollouts a launch of a kernel makes, and the programs that are timed."""
 
-import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -13,8 +11,9 @@ import numpy as np
 
 import dano
 from benchmarks._subjects import shipped_bunny
+from benchmarks.robots.push import panda
 from benchmarks.robots.push._case import BEHIND, BUNNY, DOWN, HEIGHT, RADIUS, READY
-from benchmarks.speed._arms import panda, strikes
+from benchmarks.speed._arms import strikes
 from benchmarks.speed._crowds import crowds
 from benchmarks.speed._dano import FRICTION, sliding
 
@@ -58,16 +57,18 @@ class Case:
         arrays = eqx.filter(self.scene, eqx.is_array)
         shaken = jnp.linspace(0.8, 1.2, worlds)[:, None] * self.state.velocity[0]
         given = arrays, self.state, shaken
-        if self.narrow:
-            given = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, given)
-        return given
+        return self._narrowed(given)
+
+    def _narrowed(self, arrays: Any) -> Any:
+        """A tree of arrays in float32 where the case is."""
+        if not self.narrow:
+            return arrays
+        return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, arrays)
 
     def program(self, n_steps: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
         """Positions at the ends of all steps, and which steps were solved, of all worlds."""
         static = eqx.filter(self.scene, eqx.is_array, inverse=True)
-        controls = jax.tree.map(lambda x: x[None].repeat(n_steps, axis=0), self.control)
-        if self.narrow:
-            controls = jax.tree.map(lambda x: x.astype(jnp.float32), controls)
+        controls = self._narrowed(jax.tree.map(lambda x: x[None].repeat(n_steps, axis=0), self.control))
 
         def rolled(arrays: dano.Scene, state: dano.State, shaken: jax.Array) -> tuple[jax.Array, jax.Array]:
             scene = eqx.combine(arrays, static)
@@ -131,10 +132,9 @@ def _boxes() -> Case:
 
 def _panda() -> Case:
     """The arm with a ball for a tool moves through the bunny's place; its joints have been set in motion."""
-    spec = importlib.util.find_spec("frax")
-    if spec is None or spec.origin is None:
+    path = panda()
+    if path is None:
         raise FileNotFoundError("the Panda is not there: pip install frax")
-    path = next(Path(spec.origin).parent.rglob("panda*.urdf"))
     robot, subject = dano.load_urdf(path, collision=False), shipped_bunny()
     tool = dano.Body("tool", dano.Sphere(RADIUS), mass=0.2)
     weld = dano.Joint(robot.bodies[-1].name, "tool", "weld", position=(0, 0, 0.2))

@@ -2,9 +2,7 @@
 
 import dataclasses
 import functools
-import importlib.util
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,6 +11,7 @@ import numpy as np
 
 import dano
 from benchmarks._measure import compiled
+from benchmarks.robots.push import panda
 from benchmarks.speed._cases import Case
 from dano.maths import Numbers
 
@@ -46,15 +45,6 @@ class Arm(NamedTuple):
     scene: dano.Scene
     state: dano.State
     control: dano.Control
-
-
-def panda() -> Path | None:
-    """The file of the arm, which the package frax ships."""
-    found = importlib.util.find_spec("frax")
-    if found is None or found.origin is None:
-        return None
-    path = Path(found.origin).parent / "assets" / "franka_panda" / "panda.urdf"
-    return path if path.is_file() else None
 
 
 def _robot() -> dano.Robot:
@@ -176,19 +166,21 @@ def arm_case(arm: Arm) -> Case:
     run, seconds = compiled(rollout, arrays, arm.state)
     done = jax.block_until_ready(run(arrays, arm.state))
     failed = int(np.sum(~np.asarray(done.converged)))
-    note = f"{float(np.mean(np.asarray(done.iterations))):.1f} iterations" + _box_note(arm, done.states)
+    ends = np.asarray(done.states.position)[-1]
+    note = f"{float(np.mean(np.asarray(done.iterations))):.1f} iterations"
+    note += _box_note(arm, lambda name: ends[arm.scene.index(name)])
     note += f", {failed} steps NOT converged" if failed else ""
     return Case(
         _group(arm), arm.name, lambda: run(arrays, arm.state), N_STEPS, compile_seconds=seconds, note=note
     )
 
 
-def _box_note(arm: Arm, states: dano.State) -> str:
-    """How far the box has gone: whether it was struck, and is still held."""
+def _box_note(arm: Arm, end_of: Callable[[str], np.ndarray]) -> str:
+    """How far the box has gone to where it ends [m]: whether it was struck, and is still held."""
     if "box" not in arm.scene.names:
         return ""
-    places = np.asarray(states.position)[:, arm.scene.index("box")]
-    return f", the box moves by {1000 * np.linalg.norm(places[-1] - places[0]):.1f} mm"
+    way = np.linalg.norm(end_of("box") - np.asarray(arm.state.position[arm.scene.index("box")]))
+    return f", the box moves by {1000 * way:.1f} mm"
 
 
 def mujoco_arm_case(arm: Arm) -> Case:
@@ -208,10 +200,6 @@ def mujoco_arm_case(arm: Arm) -> Case:
         mujoco.mj_step(model, data, N_STEPS)
 
     run()
-    note = f"{data.ncon} contact points at the end"
-    if "box" in arm.scene.names:
-        before = np.asarray(arm.state.position[arm.scene.index("box")])
-        way = np.linalg.norm(data.body("box").xipos - before)
-        note += f", the box moves by {1000 * way:.1f} mm"
+    note = f"{data.ncon} contact points at the end" + _box_note(arm, lambda name: data.body(name).xipos)
     note += ", UNSTABLE" if any(warning.number for warning in data.warning) else ""
     return Case(_group(arm), f"MuJoCo: {arm.name}", run, N_STEPS, note=note)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from benchmarks import _subjects
 from benchmarks._measure import load_average, NO_DATA, parse_arguments, report, Row, skipped, warm_up
+from benchmarks.robots.push import panda
 from benchmarks.speed import _arms, _crowds, _dano, _learning, _mujoco, _mujoco_crowds
 from benchmarks.speed._cases import Case, measure
 
@@ -100,7 +101,7 @@ def _chosen(arguments: argparse.Namespace, missing: list[Row]) -> list[str]:
             names.remove(_key(crowd))
             reason = f"more than --largest {arguments.largest} bodies"
             missing.append(skipped(crowd.group, crowd.name, reason))
-    if _arms.panda() is None and _arms.ARMS.keys() & names:
+    if panda() is None and _arms.ARMS.keys() & names:
         names = [name for name in names if name not in _arms.ARMS]
         missing.append(
             skipped("An arm", "all of it", "the package frax, which ships the Panda, is not installed")

@@ -51,11 +51,7 @@ class FilmOptions:
 
     every: int = 1
     pixels: Float[np.ndarray, "n 2"] | None = None
-    background: Numbers = (
-        0.0,
-        0.0,
-        0.0,
-    )
+    background: Numbers = (0.0, 0.0, 0.0)
     shutter: float = 0.0
     sampling: Sampling = FILM_SAMPLING
 

@@ -22,7 +22,6 @@ _HALF_SPACE = wp.constant(HALF_SPACE)
 class NearPair:
     """A pair as a step looks at it."""
 
-    place: int  # In `Scene.pair_index`
     first: int  # Its bodies
     second: int
     contact: int  # Of `Scene.materials`
@@ -36,7 +35,6 @@ def near_pair(scene: wp.ref[Scene], world: int, place: int) -> NearPair:
     """The pair at a place."""
     index = scene.pair_index[place]
     pair = NearPair()
-    pair.place = place
     pair.first = index.first
     pair.second = index.second
     pair.contact = index.contact

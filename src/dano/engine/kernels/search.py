@@ -228,8 +228,7 @@ def find_points(
             first_sample = _BLOCK * (b - lane + share_of.block) + share_of.begin
             for s in range(first_sample, first_sample + share_of.count):
                 sample = scene.samples[world, s]
-                x = position_in_solid(pose, sample.point)
-                d = solid_distance(scene.solids, world, solid, x)
+                d = solid_distance(scene.solids, world, solid, position_in_solid(pose, sample.point))
                 if d.value <= reach:
                     facing = facing_area(pose, sample, solid_normal(d.gradient))
                     back = bool(False)
@@ -283,34 +282,6 @@ def list_points(
         back.turned = True
         found = find_points(scene, room, world, lane, pair, pose, back, found)
     return found
-
-
-@wp.func
-def impact_of(
-    a: BodyState, b: BodyState, material: Material, found: FoundPair, pair: NearPair, alone: bool, waits: bool
-) -> Impact:
-    """The impact of a pair; none where it approaches slowly.
-
-    Args:
-        a: First body.
-        b: Second body.
-        material: Of the contact.
-        found: What is found of the pair, with its patch.
-        pair: The pair.
-        alone: Whether one of the bodies is fixed.
-        waits: Whether impulses may wait until the bodies meet.
-    """
-    numbers = pair.numbers
-    impact = no_impact(numbers.impact_depth, numbers.factor, numbers.deepest, pair.h)
-    if found.patch.load > ZERO:
-        impact.share = share_of_impact(found.patch, material.bounce)
-        if impact.share > ZERO and found.hits > 0:
-            impact.stiffness = stiffness_of_impact(a, b, found.patch, material.bounce, numbers.factor, pair.h)
-            impact = delayed(impact, wp.where(waits, impact.share, ZERO), found.share, pair.h)
-            impact.rests = left_out(found, numbers.factor)
-            if alone:
-                impact.turns = turning_after(a, b, found.patch, material.friction, found.share, pair.turning)
-    return impact
 
 
 @wp.func
@@ -448,6 +419,33 @@ def coming_of(
 
 
 @wp.func
+def impact_of(
+    a: BodyState, b: BodyState, material: Material, found: FoundPair, pair: NearPair, coming: Coming
+) -> Impact:
+    """The impact of a pair with a patch, in place of none; still none where it approaches slowly.
+
+    Args:
+        a: First body.
+        b: Second body.
+        material: Of the contact.
+        found: What is found of the pair.
+        pair: The pair.
+        coming: How it comes to meet.
+    """
+    impact = found.impact
+    if found.patch.load > ZERO:
+        impact.share = share_of_impact(found.patch, material.bounce)
+        if impact.share > ZERO and found.hits > 0:
+            factor = pair.numbers.factor
+            impact.stiffness = stiffness_of_impact(a, b, found.patch, material.bounce, factor, pair.h)
+            impact = delayed(impact, wp.where(coming.waits, impact.share, ZERO), found.share, pair.h)
+            impact.rests = left_out(found, factor)
+            if coming.alone:
+                impact.turns = turning_after(a, b, found.patch, material.friction, found.share, pair.turning)
+    return impact
+
+
+@wp.func
 def find_pair(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, p: int, entry: int, at: int, end: int
 ) -> int:
@@ -496,7 +494,7 @@ def find_pair(
         found.patch = listed.patch
         found.impact = no_impact(numbers.impact_depth, numbers.factor, numbers.deepest, pair.h)
         if not lasts:
-            found.impact = impact_of(seen, other, material, found, pair, coming.alone, coming.waits)
+            found.impact = impact_of(seen, other, material, found, pair, coming)
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share

@@ -343,7 +343,7 @@ def _kinds_of_bodies(
         np.array([body.fixed for body in bodies]),
     ]
     if others is not None:
-        told += [np.array(x) for x in (others.flat, others.shapes, others.fixed)]
+        told += [np.array(others.flat), np.array(others.shapes)]
     numbers = [np.asarray(x, float).reshape(n, -1) for x in (extents, *columns, *told)]
     return np.unique(np.concatenate(numbers, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
 

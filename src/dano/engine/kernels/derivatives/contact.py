@@ -295,22 +295,20 @@ def pull_support(
     The others are those by what supports them, by `left_out` and by the depth at which they meet.
     """
     index = scene.pair_index[found.pair]
-    pair = numbers_of(scene, world, found.pair)
-    turning = scene.body_index[index.first].turning
-    h = scene.timestep[world, 0]
-    a = falling(room.bodies[world, index.first], found.first_falls)
-    b = falling(room.bodies[world, index.second], found.second_falls)
     near = near_pair(scene, world, found.pair)
+    pair = near.numbers
+    a = falling(room.bodies[world, near.first], found.first_falls)
+    b = falling(room.bodies[world, near.second], found.second_falls)
     toward = facing(scene, world, near, a, b, ZERO)
     at = met_pair(scene, world, found, a, b, ZERO, toward)
     samples = Touching()
-    samples.material = scene.materials[world, index.contact]
-    samples.timestep = h
+    samples.material = scene.materials[world, near.contact]
+    samples.timestep = near.h
     samples.pose = posed(scene, world, near, a, b, ZERO)
-    samples.fall = fall_of(a, b, pair.impact_depth, h)
+    samples.fall = fall_of(a, b, pair.impact_depth, near.h)
     asked = Asked()
     whole, by_rest, by_depth, by_material, by_factor, _a, _b, _c, _d, _e = wp.grad(support_work)(
-        at, found.rest, pair.impact_depth, samples.material, pair.factor, turning, support_bar,
+        at, found.rest, pair.impact_depth, samples.material, pair.factor, near.turning, support_bar,
         total_met(bar), total(depth_bar), rests_bar,
     )  # fmt: skip
     asked.rest = by_rest
@@ -413,13 +411,14 @@ def pull_pair(
     `rebound` is the share of the restitution that counts.
     """
     index = scene.pair_index[found.pair]
-    pair = numbers_of(scene, world, found.pair)
-    turning = scene.body_index[index.first].turning
-    h = scene.timestep[world, 0]
+    near = near_pair(scene, world, found.pair)
+    pair = near.numbers
+    turning = near.turning
+    h = near.h
     a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
     at = met_pair(scene, world, found, a, b, found.share, found.toward)
     samples = touching_of(scene, world, found)
-    samples.pose = posed(scene, world, near_pair(scene, world, found.pair), a, b, found.share)
+    samples.pose = posed(scene, world, near, a, b, found.share)
     samples.pose.com_difference = found.com_difference
     restores = ONE
     if samples.material.instant > ZERO:
