@@ -299,6 +299,137 @@ def side_touch(side: Side, pose: PairPose, start: AtStart, x: vec3, normal: vec3
     return touch
 
 
+@wp.struct
+class Asking:
+    """How the samples of a side are asked."""
+
+    pose: PairPose
+    start: AtStart
+    fast: bool  # Whether bodies would sink too deep into each other within the step
+    reach: real  # What is further away is not listed [m]
+    margin: real  # Distance within which samples touch [m]
+    gap: real  # What is nearer than the margin by less is only near [m]
+    sink: real  # Depth by which bodies may sink into each other [m]
+    h: real  # Timestep [s]
+
+
+@wp.func
+def asking_of(
+    known: wp.ref[Known],
+    model: wp.ref[Model],
+    side: Side,
+    margin: real,
+    gap: real,
+    sink: real,
+    way: real,
+    h: real,
+) -> Asking:
+    """How the samples of a side are asked; bodies move by a way within the step [m]."""
+    asking = Asking()
+    asking.margin = margin
+    asking.gap = gap
+    asking.sink = sink
+    asking.h = h
+    share = ZERO
+    asking.fast = way > sink
+    if asking.fast:
+        share = meeting(known, model, side, sink, way, h)
+        # Nothing sinks too deep.
+        if share >= ONE:
+            share = ZERO
+            asking.fast = False
+    asking.pose = side_pose(known, side, share, h)
+    asking.start = at_start(side, share, h)
+    asking.reach = margin
+    if asking.fast:
+        asking.reach = margin + way
+    return asking
+
+
+@wp.struct
+class LastSample:
+    """What the samples before say of the next."""
+
+    at: vec3  # Where the distance was asked for last [m, frame of the solid]
+    distance: real  # What it was [m]: a bound for samples beside it
+
+
+@wp.func
+def distance_beside(
+    known: wp.ref[Known], model: wp.ref[Model], side: Side, reach: real, x: vec3, seen: wp.ref[LastSample]
+) -> tuple[real, vec3, int]:
+    """`distance_with_faces` at a point; only a bound, and no gradient, where that is beyond reach."""
+    # Most samples of a near block are not near.
+    value = real(-INFINITY)
+    gradient = vec3()
+    flat = int(0)
+    if side.other.solid == _GRID:
+        value = seen.distance - STEEPEST * wp.length(x - seen.at)
+    if value <= reach + side.slack:
+        # Beside what is near, most are: their values are not asked without gradients. Nor are those beside
+        # flat faces, where they are less exact than planes.
+        enough = real(-INFINITY)
+        if side.other.faces == 0 and seen.distance > reach:
+            enough = reach
+        value = quick_clearance(known, side.other, x, enough)
+        seen.distance = value
+        seen.at = x
+    if value <= reach + side.slack:
+        value, gradient, flat = distance_with_faces(known, model, side.other, side.band, x)
+        seen.distance = value
+    return value, gradient, flat
+
+
+@wp.func
+def touch_of_sample(
+    known: wp.ref[Known],
+    side: Side,
+    asking: Asking,
+    s: int,
+    x: vec3,
+    value: real,
+    gradient: vec3,
+    of_face: int,
+) -> Touch:
+    """A sample that is near, at x of the solid's frame; its weight is zero if it does not touch."""
+    touch = Touch()
+    pose = asking.pose
+    sample = known.samples[s]
+    normal, flat = pressed_normal(pose, side.other.solid, known.facing[s], solid_normal(gradient), of_face)
+    area = facing_area(pose, sample, normal)
+    # Finer samples say better where what is round presses on a face.
+    if side.coarse == 1 and flat == 2:
+        area = ZERO
+    # Samples on the far side of a thin body do not press.
+    if area > ZERO:
+        touch = side_touch(side, pose, asking.start, x, normal, value)
+        over = touch.gap - asking.margin + asking.gap
+        end = over - asking.h * touch.nearing
+        early = asking.fast and end < -asking.sink
+        depth = asking.margin - touch.gap
+        # What is only near must not lead what presses.
+        if asking.gap > ZERO:
+            depth = wp.max(-over, _NEAR * depth)
+        if early:
+            depth = wp.max(depth, -end)
+        if depth > ZERO:
+            touch.weight = area * depth
+            touch.area = area
+            touch.flat = wp.min(flat, 1)
+            on_face = wp.dot(known.facing[s], known.facing[s]) > ZERO
+            # What is round on what is flat, either of which may be that of the sample.
+            if flat == 2 or (flat == 1 and known.rim[s] == 0 and not on_face):
+                own = pose.points * sample.area
+                if flat == 2:
+                    own = -solid_normal(gradient)
+                if side.index.turning == 0 or flat == 2:
+                    touch.flat = 2
+                    touch.slope = asking.start.turn * slope_of(own, normal)
+            touch.precedence = known.precedence[s]
+            touch.presses = wp.where(early or over < ZERO, 1, 0)
+    return touch
+
+
 @wp.func
 def list_side(
     known: wp.ref[Known],
@@ -313,25 +444,13 @@ def list_side(
     begin: int,
 ) -> int:
     """List the samples of a side that touch, from a place on; the place beyond the last."""
-    share = ZERO
-    fast = way > sink
-    if fast:
-        share = meeting(known, model, side, sink, way, h)
-        # Nothing sinks too deep.
-        if share >= ONE:
-            share = ZERO
-            fast = False
-    pose = side_pose(known, side, share, h)
-    start = at_start(side, share, h)
+    asking = asking_of(known, model, side, margin, gap, sink, way, h)
+    points = asking.pose.points
+    origin = asking.pose.origin
+    reach = asking.reach
     stretch = stretch_of(side)
-    reach = margin
-    if fast:
-        reach = margin + way
-    points = pose.points
-    origin = pose.origin
-    # Where the distance was asked for last, and what it was: a bound for samples beside it.
-    seen_at = vec3()
-    seen = real(-INFINITY)
+    seen = LastSample()
+    seen.distance = -INFINITY
     at = int(begin)
     block = int(side.index.first_block)
     last = block + side.index.blocks
@@ -339,63 +458,13 @@ def list_side(
         block = next_near_block(known, model, side, points, origin, stretch, reach + side.slack, block, last)
         if block < last:
             for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
-                sample = known.samples[s]
-                x = points * sample.point + origin
-                # Most samples of a near block are not near.
-                value = real(-INFINITY)
-                gradient = vec3()
-                flat = int(0)
-                if side.other.solid == _GRID:
-                    value = seen - STEEPEST * wp.length(x - seen_at)
-                if value <= reach + side.slack:
-                    # Beside what is near, most are: their values are not asked without gradients. Nor are
-                    # those beside flat faces, where they are less exact than planes.
-                    enough = real(-INFINITY)
-                    if side.other.faces == 0 and seen > reach:
-                        enough = reach
-                    value = quick_clearance(known, side.other, x, enough)
-                    seen = value
-                    seen_at = x
-                if value <= reach + side.slack:
-                    value, gradient, flat = distance_with_faces(known, model, side.other, side.band, x)
-                    seen = value
+                x = points * known.samples[s].point + origin
+                value, gradient, flat = distance_beside(known, model, side, reach, x, seen)
                 if value <= reach:
-                    normal, flat = pressed_normal(
-                        pose, side.other.solid, known.facing[s], solid_normal(gradient), flat
-                    )
-                    area = facing_area(pose, sample, normal)
-                    # Finer samples say better where what is round presses on a face.
-                    if side.coarse == 1 and flat == 2:
-                        area = ZERO
-                    # Samples on the far side of a thin body do not press.
-                    if area > ZERO:
-                        touch = side_touch(side, pose, start, x, normal, value)
-                        over = touch.gap - margin + gap
-                        end = over - h * touch.nearing
-                        early = fast and end < -sink
-                        depth = margin - touch.gap
-                        # What is only near must not lead what presses.
-                        if gap > ZERO:
-                            depth = wp.max(-over, _NEAR * depth)
-                        if early:
-                            depth = wp.max(depth, -end)
-                        if depth > ZERO:
-                            touch.weight = area * depth
-                            touch.area = area
-                            touch.flat = wp.min(flat, 1)
-                            on_face = wp.dot(known.facing[s], known.facing[s]) > ZERO
-                            # What is round on what is flat, either of which may be that of the sample.
-                            if flat == 2 or (flat == 1 and known.rim[s] == 0 and not on_face):
-                                own = pose.points * sample.area
-                                if flat == 2:
-                                    own = -solid_normal(gradient)
-                                if side.index.turning == 0 or flat == 2:
-                                    touch.flat = 2
-                                    touch.slope = start.turn * slope_of(own, normal)
-                            touch.precedence = known.precedence[s]
-                            touch.presses = wp.where(early or over < ZERO, 1, 0)
-                            work.touches[at] = touch
-                            at += 1
+                    touch = touch_of_sample(known, side, asking, s, x, value, gradient, flat)
+                    if touch.weight > ZERO:
+                        work.touches[at] = touch
+                        at += 1
             block += 1
     return at
 
