@@ -113,7 +113,7 @@ def test_all_sources_count():
     behind = _declared.modules_behind("dano.engine.kernels.rollout")
     assert {"dano.physics.point_law", "dano.engine.kernels.solve", "dano.physics.features"} <= set(behind)
     assert not any("derivatives" in name for name in behind)
-    assert "dano.engine.kernels.derivatives.adjoint" in _declared.modules_behind(
+    assert "dano.engine.kernels.derivatives.bodies" in _declared.modules_behind(
         "dano.engine.kernels.derivatives.pullback"
     )
     other = FEATURES.but(WIDE=True)

@@ -3,62 +3,257 @@
 import warp as wp
 
 from dano.engine.kernels.assembly import presses
-from dano.engine.kernels.derivatives.adjoint import (
-    apart_work,
-    Asked,
-    critical_work,
-    distance_work,
-    facing_work,
-    fall_work,
-    impact_work,
-    MEETS,
-    MetPair,
-    origin_in_solid,
-    pose_work,
-    PRESSES,
-    RESTS,
-    sample_work,
-    support_work,
-    Touching,
-    Virtual,
-    Waiting,
-    waiting_work,
-)
-from dano.engine.kernels.impacts import apart_at_start
+from dano.engine.kernels.impacts import apart_at_start, support_before, support_on_way
 from dano.engine.kernels.lanes import total, total_of
-from dano.engine.kernels.near import (
-    as_they_meet,
-    facing,
-    left_out,
-    near_pair,
-    posed,
-    solid_of_body,
-)
-from dano.engine.kernels.tables import FoundPair, numbers_of, Room, Scene
+from dano.engine.kernels.near import as_they_meet, facing, left_out, near_pair, NearPair, solid_of_body
+from dano.engine.kernels.search import Coming, impact_of
+from dano.engine.kernels.tables import FoundPair, Room, SamplePair, Scene
 from dano.physics.features import KINDS, LANES, TREES, UNIONS
-from dano.physics.friction import Slip
-from dano.physics.impacts import fall_of
-from dano.physics.pairs import BALL, BodyState, falling, falling_bar, first_touch, PairPose
-from dano.physics.point_law import Material, point_motion, slip_at, slip_of
+from dano.physics.friction import friction_near, Slip
+from dano.physics.impacts import (
+    depth_beside,
+    fall_of,
+    Impact,
+    Patch,
+    patch_of_sample,
+    Rest,
+    rest_of_sample,
+    share_left_out,
+    support_of,
+    supported,
+)
+from dano.physics.pairs import (
+    AXIS,
+    BALL,
+    BodyState,
+    centres_apart,
+    closer,
+    falling,
+    falling_bar,
+    first_touch,
+    FIXED,
+    pair_pose,
+    PairPose,
+    seen_from,
+    shrunk,
+)
+from dano.physics.point_law import (
+    friction_bound,
+    Material,
+    point_law,
+    point_motion,
+    slip_at,
+    slip_of,
+    traction,
+)
 from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
-from dano.physics.samples import facing_area, position_in_solid, solid_normal
+from dano.physics.samples import facing_area, point_contact, position_in_solid, Sample, solid_normal
 from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.solids.grids import distance_change
 from dano.physics.solids.kinds import GRID
-from dano.physics.solids.leaves import Distance, Leaf
-from dano.physics.structures import adding_of, addition_of, after_adjoints, product_of, scaled_of
-from dano.physics.twists import relative_twist
+from dano.physics.solids.leaves import Distance, Leaf, Solids
+from dano.physics.structures import (
+    adding_of,
+    addition_of,
+    after_adjoints,
+    need_adjoints,
+    product_of,
+    scaled_of,
+    vjp_of,
+)
+from dano.physics.twists import joined, relative_twist, wrench_at
 
-_BALL, _GRID, _LANES = wp.constant(BALL), wp.constant(GRID), wp.constant(LANES)
-_PRESSES, _MEETS, _RESTS = wp.constant(PRESSES), wp.constant(MEETS), wp.constant(RESTS)
+PRESSES, MEETS, RESTS = wp.constant(0), wp.constant(1), wp.constant(2)
+"""What is asked of samples: the work of those that press; the patch of an impact; what a pair rests on."""
+
+_AXIS, _BALL, _FIXED = map(wp.constant, (AXIS, BALL, FIXED))
+_GRID, _LANES = wp.constant(GRID), wp.constant(LANES)
+
+
+@wp.struct
+class Virtual:
+    """Twists of the bodies of a pair [W]: at the end of the step, and virtual ones."""
+
+    first: vec6
+    second: vec6
+    first_virtual: vec6
+    second_virtual: vec6
+
+
+@wp.struct
+class Waiting:
+    """A pair's part of derivatives by what its bodies wait for: see `BodyState`."""
+
+    met: real
+    lead: real
+    first_support: vec6
+    second_support: vec6
+
+
+@wp.struct
+class MetPair:
+    """The bodies of a pair, and when and how they meet."""
+
+    first: BodyState  # The sampled body
+    second: BodyState  # The other
+    scale: vec3  # Semi-axes of the first [m]
+    share: real  # τ
+    timestep: real  # h [s]
+    toward: vec3  # Direction that samples which turn face [F]
+    follows: real  # 1 where points follow the second body
+    turning: int  # How samples of the first turn
+
+
+@wp.struct
+class Touching:
+    """What the samples of a pair depend on besides themselves and solids."""
+
+    pose: PairPose  # Where geometry is taken
+    share: real  # τ
+    timestep: real  # h [s]
+    numbers: SamplePair
+    fall: real  # See `fall_of` [m]
+    rests: real  # See `share_left_out`
+    material: Material  # With the share of the restitution that counts
+    impact: Impact
+    turning: int  # How samples turn
+
+
+@wp.struct
+class Asked:
+    """By what samples give: derivatives."""
+
+    patch: Patch
+    rest: Rest
+
+
+patch_product, rest_product = product_of(Patch), product_of(Rest)
+body_product = product_of(BodyState)
+distance_work, impact_work = vjp_of(leaf_distance), vjp_of(impact_of)
+
+
+@wp.func
+def sample_work(
+    what: int,
+    at: Touching,
+    twists: Virtual,
+    sample: Sample,
+    d: Distance,
+    presses_back: bool,
+    slip: Slip,
+    asked: Asked,
+) -> real:
+    """Work of a point's impulse along the virtual velocities of its bodies; or ⟨bars, what a sample adds⟩."""
+    h = at.timestep
+    point = point_contact(at.pose, sample, d, at.turning, presses_back, at.numbers.share, at.share * h)
+    if what == PRESSES:
+        law = point_law(at.material, point, at.impact)
+        apart = at.pose.com_difference
+        twist = relative_twist(twists.first, twists.second, apart)
+        virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
+        motion = point_motion(point, twist.velocity, twist.spin)
+        found = traction(law, motion.rate, motion.slip + law.extra_slip)
+        if slip.is_gradual:
+            bound = friction_bound(law, found.pressure)
+            found.friction = friction_near(motion.slip + law.extra_slip, bound.value, slip)
+        by_pressure = wp.dot(point.normal, virtual.velocity) + wp.dot(point.moment, virtual.spin)
+        by_friction = wp.dot(found.friction, virtual.velocity + wp.cross(virtual.spin, point.arm))
+        return h * point.area * (found.pressure * by_pressure + by_friction)
+    bounce = at.material.bounce
+    if what == MEETS:
+        depth = at.numbers.impact_depth
+        of_patch = patch_of_sample(
+            point.area, point.sunk, depth, point.approach, bounce, at.rests, point.arm, point.normal
+        )
+        return patch_product(asked.patch, of_patch)
+    of_rest = rest_of_sample(point.depth, at.fall, point.approach, bounce, point.arm, point.normal)
+    return rest_product(asked.rest, of_rest)
+
+
+@wp.func
+def pose_of(at: MetPair, turning: int) -> PairPose:
+    """Pose of a pair when geometry is taken, with samples that turn in a way."""
+    return pair_pose(at.first, at.second, at.share, at.timestep, at.toward, turning, at.scale, at.follows)
+
+
+pose_work, apart_work = vjp_of(pose_of), vjp_of(centres_apart)
+
+
+@wp.func
+def critical_work(at: MetPair, sample: vec3, gradient: vec3) -> real:
+    """Distance of a sample from a solid when geometry is taken, as it changes with where the sample is."""
+    return wp.dot(gradient, position_in_solid(pose_of(at, at.turning), sample))
+
+
+@wp.func
+def facing_work(
+    solids: Solids, world: int, solid: Solid, at: MetPair, point: vec3, by_toward: vec3, bar: vec3
+) -> real:
+    """⟨bars, direction that samples face, and where one step of the search for it leads from a point⟩."""
+    pose = pose_of(at, _FIXED)
+    if at.turning == _AXIS:
+        return wp.dot(by_toward, seen_from(solids, world, solid, pose.points, pose.origin).gradient)
+    found = closer(solids, world, solid, pose.points, pose.origin, at.scale, point)
+    least = wp.min(at.scale[0], wp.min(at.scale[1], at.scale[2]))
+    touched = shrunk(at.scale, least, point) + wp.max(found.value, ZERO) * found.gradient
+    return wp.dot(by_toward, found.gradient) + wp.dot(bar, touched)
+
+
+@wp.func
+def waiting_work(found: FoundPair, apart: vec3, twists: Virtual, waiting: Waiting) -> real:
+    """What an impulse that waits until its bodies meet makes of the equations besides its own work.
+
+    That is the work of what they rest on until then, ⟨bars, their way meanwhile⟩ and ⟨bars, when angular
+    momentum is balanced⟩; `apart` is from the second centre of mass to the first when the step begins [m, W].
+    """
+    virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
+    carried = relative_twist(waiting.first_support, waiting.second_support, apart)
+    work = wp.dot(support_before(found), joined(virtual.velocity, virtual.spin))
+    work += wp.dot(support_on_way(found), joined(carried.velocity, carried.spin))
+    return work + found.impact.delays * (waiting.met * found.share - waiting.lead)
+
+
+@wp.func
+def support_work(
+    at: MetPair,
+    rest: Rest,
+    numbers: SamplePair,
+    material: Material,
+    bar: vec6,
+    met_bar: MetPair,
+    depth_bar: real,
+    rests_bar: real,
+) -> real:
+    """⟨bars, what a pair rests on while it nears an impact, its bodies as they meet, and their depth⟩."""
+    h = at.timestep
+    impulse = support_of(at.first, at.second, rest, material.friction, h, at.turning)
+    back = wrench_at(impulse, at.first.position - at.second.position)
+    total = wp.dot(bar, impulse) + depth_bar * depth_beside(rest, numbers.impact_depth)
+    total += rests_bar * share_left_out(rest, numbers.factor)
+    total += body_product(met_bar.first, supported(at.first, impulse, h))
+    return total + body_product(met_bar.second, supported(at.second, -back, h))
+
+
+@wp.func
+def fall_work(at: MetPair, numbers: SamplePair, bar: real) -> real:
+    """⟨bar, how far bodies fall in a step⟩."""
+    return bar * fall_of(at.first, at.second, numbers.impact_depth, at.timestep)
+
+
+for _function in (
+    sample_work, distance_work, pose_work, apart_work, critical_work, facing_work, impact_work, waiting_work,
+    support_work, fall_work,
+):  # fmt: skip
+    need_adjoints(_function)
 
 
 add_to_met, total_met = adding_of(MetPair), total_of(MetPair)
 scaled_met, add_to_state = scaled_of(MetPair), adding_of(BodyState)
 add_to_touching, total_touching = adding_of(Touching), total_of(Touching)
 add_to_twists, total_twists = adding_of(Virtual), total_of(Virtual)
-add_to_leaf, add_to_material = addition_of(Leaf), addition_of(Material)
-distance_product = product_of(Distance)
+add_to_leaf, add_to_material, add_to_pair = map(addition_of, (Leaf, Material, SamplePair))
+add_material = adding_of(Material)
+scaled_leaf, distance_product = scaled_of(Leaf), product_of(Distance)
 
 
 @wp.func
@@ -121,33 +316,32 @@ def pull_samples(
 
     `what` is asked of them, see `PRESSES`.
     """
-    index = scene.pair_index[found.pair]
-    turning = scene.body_index[index.first].turning
+    second = scene.pair_index[found.pair].second
     bar = Touching()
     twists_bar = Virtual()
     twist = relative_twist(twists.first, twists.second, at.pose.com_difference)
     for k in range(found.first, found.end):
         where = room.where[world, k]
-        counts = presses(room, world, k)
-        if what != _PRESSES:
-            counts = where.presses_back == 0
-            if what == _MEETS:
-                counts = counts and room.points[world, k].sunk > -at.depth
+        counts = where.presses_back == 0
+        if what == PRESSES:
+            counts = presses(room, world, k)
+        elif what == MEETS:
+            counts = counts and room.points[world, k].sunk > -at.numbers.impact_depth
         if counts:
             sample = scene.samples[world, where.sample]
             x = position_in_solid(at.pose, sample.point)
-            solid = leaf_at(scene, world, index.second, x)
+            solid = leaf_at(scene, world, second, x)
             d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
             slip = Slip()
-            if what == _PRESSES:
+            if what == PRESSES:
                 law = room.laws[world, k]
                 motion = slip_of(law, point_motion(room.points[world, k], twist.velocity, twist.spin))
                 slip = slip_at(law, motion.slip, room.linear[world, k].grip)
-            if what == _RESTS:
+            if what == RESTS:
                 counts = d.value < at.fall and facing_area(at.pose, sample, solid_normal(d.gradient)) > ZERO
             if counts:
-                _a, by, by_twists, by_sample, by_distance, _b, _c, _d, _e = wp.grad(sample_work)(
-                    what, at, twists, sample, d, turning, where.presses_back > 0, slip, asked
+                _a, by, by_twists, by_sample, by_distance, _b, _c, _d = wp.grad(sample_work)(
+                    what, at, twists, sample, d, where.presses_back > 0, slip, asked
                 )
                 by_x = pull_distance(scene, room, world, lane, solid, x, by_distance)
                 # x = points · sample + origin
@@ -171,16 +365,16 @@ def facing_point_bar(
 ) -> vec3:
     """Derivative by where the search for the first touch ended, x = G(x): (1 − ∂G/∂x)⁻ᵀ x̄."""
     zero = vec3()
-    _a, _b, _c, _d, _e, point_bar, _f, _g = wp.grad(facing_work)(
-        scene.solids, world, solid, at, _BALL, point, toward_bar, zero
+    _a, _b, _c, _d, point_bar, _e, _f = wp.grad(facing_work)(
+        scene.solids, world, solid, at, point, toward_bar, zero
     )
     rows = mat33()
     k = int(0)
     while k < 3:
         unit = vec3()
         unit[k] = ONE
-        _h, _i, _j, _k, _l, by_point, _m, _n = wp.grad(facing_work)(
-            scene.solids, world, solid, at, _BALL, point, zero, unit
+        _g, _h, _i, _j, by_point, _k, _l = wp.grad(facing_work)(
+            scene.solids, world, solid, at, point, zero, unit
         )
         rows[k] = unit - by_point
         k += 1
@@ -189,26 +383,29 @@ def facing_point_bar(
 
 @wp.func
 def pull_facing(
-    scene: wp.ref[Scene], world: int, second: int, turning: int, at: MetPair, toward_bar: vec3
+    scene: wp.ref[Scene], world: int, second: int, at: MetPair, bar: MetPair
 ) -> tuple[MetPair, int, Leaf]:
-    """Derivatives through the direction that samples face: by the pair, and by a leaf and which it is.
+    """Derivatives by a pair, with those through the direction that samples face; by a leaf, and which it is.
 
     A ball or an ellipsoid faces where the search for its first touch ended: a fixed point of the search,
     differentiated by the implicit function theorem.
     """
-    origin, turn = origin_in_solid(at)
+    if at.turning == _FIXED:
+        return bar, scene.body_index[second].first_leaf, Leaf()
+    pose = pose_of(at, _FIXED)
     point = vec3()
-    solid = leaf_at(scene, world, second, origin)
+    solid = leaf_at(scene, world, second, pose.origin)
     point_bar = vec3()
-    if turning == _BALL:
+    if at.turning == _BALL:
         whole = solid_of_body(scene, world, second)
-        point = first_touch(scene.solids, world, whole, turn, origin, at.scale)
-        solid = leaf_at(scene, world, second, origin + turn * point)
-        point_bar = facing_point_bar(scene, world, solid, at, point, toward_bar)
-    _a, _b, by_solid, bar, _c, _d, _e, _f = wp.grad(facing_work)(
-        scene.solids, world, solid, at, turning, point, toward_bar, point_bar
+        point = first_touch(scene.solids, world, whole, pose.points, pose.origin, at.scale)
+        solid = leaf_at(scene, world, second, pose.origin + pose.points * point)
+        point_bar = facing_point_bar(scene, world, solid, at, point, bar.toward)
+    _a, _b, by_solid, faces, _c, _d, _e = wp.grad(facing_work)(
+        scene.solids, world, solid, at, point, bar.toward, point_bar
     )
-    return bar, solid.first, by_solid.leaf
+    add_to_met(faces, bar)
+    return faces, solid.first, by_solid.leaf
 
 
 @wp.func
@@ -217,64 +414,73 @@ def pull_pose(
     room: wp.ref[Room],
     world: int,
     lane: int,
-    found: FoundPair,
+    critical: int,
+    second: int,
     at: MetPair,
-    pose: PairPose,
     by: Touching,
 ) -> tuple[MetPair, real]:
     """Derivatives by a pair's bodies, and by the depth at which they meet, from those by its pose, τ and h.
 
-    One lane alone comes here: Warp itself adds those by coefficients.
+    One lane alone comes here: Warp itself adds those by coefficients. `critical` is the sample that says when
+    they meet, −1 for none.
     """
-    index = scene.pair_index[found.pair]
-    turning = scene.body_index[index.first].turning
-    bar, _a, _b, _c = wp.grad(pose_work)(at, turning, numbers_of(scene, world, found.pair).follows, by.pose)
-    bar.share += by.share
-    bar.timestep += by.timestep
+    of_pose, _a, _b = wp.grad(pose_work)(at, at.turning, by.pose)
+    of_pose.share += by.share
+    of_pose.timestep += by.timestep
+    bar, leaf, by_leaf = pull_facing(scene, world, second, at, of_pose)
+    add_to_leaf(room.bars.leaves, world, leaf, by_leaf)
     depth_bar = real(0.0)
-    if found.critical >= 0:
+    if critical >= 0:
         # τ is the root of distance + depth = 0 at the critical sample.
-        critical = scene.samples[world, found.critical].point
-        x = position_in_solid(pose, critical)
-        solid = leaf_at(scene, world, index.second, x)
+        point = scene.samples[world, critical].point
+        x = position_in_solid(pose_of(at, at.turning), point)
+        solid = leaf_at(scene, world, second, x)
         d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-        of, _d, of_sample, _e = wp.grad(critical_work)(at, turning, critical, d.gradient)
-        slope = of.share
-        share_bar = bar.share
-        if turning > 0:
-            along, _f, _g = pull_facing(scene, world, index.second, turning, at, of.toward)
-            slope += along.share
-            # What the points feel of the direction that they face depends on τ, too.
-            turns, _h, _i = pull_facing(scene, world, index.second, turning, at, bar.toward)
-            share_bar += turns.share
-        if slope < ZERO:
-            depth_bar = -share_bar / slope
+        of_body, of_sample, _c = wp.grad(critical_work)(at, point, d.gradient)
+        of, of_leaf, by_of_leaf = pull_facing(scene, world, second, at, of_body)
+        if of.share < ZERO:
+            depth_bar = -bar.share / of.share
             add_to_met(bar, scaled_met(depth_bar, of))
+            add_to_leaf(room.bars.leaves, world, of_leaf, scaled_leaf(depth_bar, by_of_leaf))
             of_distance = Distance()
             of_distance.value = depth_bar
-            _j = pull_distance(scene, room, world, lane, solid, x, of_distance)
+            _d = pull_distance(scene, room, world, lane, solid, x, of_distance)
             if room.bars.samples.shape[1] > 0:
-                room.bars.samples[world, found.critical].point += depth_bar * of_sample
-    if turning > 0:
-        faces, leaf, by_leaf = pull_facing(scene, world, index.second, turning, at, bar.toward)
-        add_to_leaf(room.bars.leaves, world, leaf, by_leaf)
-        add_to_met(bar, faces)
+                room.bars.samples[world, critical].point += depth_bar * of_sample
     return bar, depth_bar
 
 
 @wp.func
 def met_pair(
-    scene: wp.ref[Scene], world: int, found: FoundPair, a: BodyState, b: BodyState, share: real, toward: vec3
+    scene: wp.ref[Scene], world: int, near: NearPair, a: BodyState, b: BodyState, share: real, toward: vec3
 ) -> MetPair:
     """Bodies of a pair after a share of the step."""
     at = MetPair()
     at.first = a
     at.second = b
-    at.scale = scene.bodies[world, scene.pair_index[found.pair].first].scale
+    at.scale = scene.bodies[world, near.first].scale
     at.share = share
-    at.timestep = scene.timestep[world, 0]
+    at.timestep = near.h
     at.toward = toward
+    at.follows = near.numbers.follows
+    at.turning = near.turning
     return at
+
+
+@wp.func
+def touching_of(scene: wp.ref[Scene], world: int, found: FoundPair, near: NearPair, at: MetPair) -> Touching:
+    """What the samples of a pair depend on, with all of the restitution."""
+    samples = Touching()
+    samples.pose = pose_of(at, at.turning)
+    samples.numbers = near.numbers
+    samples.share = at.share
+    samples.timestep = at.timestep
+    samples.material = scene.materials[world, near.contact]
+    samples.turning = at.turning
+    samples.pose.com_difference = found.com_difference
+    samples.rests = left_out(found, near.numbers.factor)
+    samples.impact = found.impact
+    return samples
 
 
 @after_adjoints
@@ -294,77 +500,38 @@ def pull_support(
 
     The others are those by what supports them, by `left_out` and by the depth at which they meet.
     """
-    index = scene.pair_index[found.pair]
     near = near_pair(scene, world, found.pair)
-    pair = near.numbers
     a = falling(room.bodies[world, near.first], found.first_falls)
     b = falling(room.bodies[world, near.second], found.second_falls)
-    toward = facing(scene, world, near, a, b, ZERO)
-    at = met_pair(scene, world, found, a, b, ZERO, toward)
-    samples = Touching()
-    samples.material = scene.materials[world, near.contact]
-    samples.timestep = near.h
-    samples.pose = posed(scene, world, near, a, b, ZERO)
-    samples.fall = fall_of(a, b, pair.impact_depth, near.h)
+    at = met_pair(scene, world, near, a, b, ZERO, facing(scene, world, near, a, b, ZERO))
+    samples = touching_of(scene, world, found, near, at)
+    samples.fall = fall_of(a, b, near.numbers.impact_depth, near.h)
     asked = Asked()
-    whole, by_rest, by_depth, by_material, by_factor, _a, _b, _c, _d, _e = wp.grad(support_work)(
-        at, found.rest, pair.impact_depth, samples.material, pair.factor, near.turning, support_bar,
-        total_met(bar), total(depth_bar), rests_bar,
-    )  # fmt: skip
+    whole, by_rest, by_numbers, by_material, _a, _b, _c, _d = wp.grad(support_work)(
+        at,
+        found.rest,
+        near.numbers,
+        samples.material,
+        support_bar,
+        total_met(bar),
+        total(depth_bar),
+        rests_bar,
+    )
     asked.rest = by_rest
-    by, _f = pull_samples(scene, room, world, lane, _RESTS, found, samples, Virtual(), asked)
+    by, _e = pull_samples(scene, room, world, lane, RESTS, found, samples, Virtual(), asked)
     if lane == 0:
-        start = found
-        start.critical = -1
-        begins, _g = pull_pose(scene, room, world, lane, start, at, samples.pose, by)
-        falls, of_depth, _h = wp.grad(fall_work)(at, pair.impact_depth, by.fall)
+        begins, _f = pull_pose(scene, room, world, lane, -1, near.second, at, by)
+        falls, of_depth, _g = wp.grad(fall_work)(at, near.numbers, by.fall)
         add_to_met(whole, begins)
         add_to_met(whole, falls)
         whole.scale += bar.scale
         whole.timestep += bar.timestep
-        room.bars.pairs[world, index.row].factor += by_factor
-        room.bars.pairs[world, index.row].impact_depth += by_depth + of_depth
-        add_to_material(room.bars.materials, world, index.contact, by_material)
-        add_to_material(room.bars.materials, world, index.contact, by.material)
+        row = scene.pair_index[found.pair].row
+        add_to_pair(room.bars.pairs, world, row, by_numbers)
+        add_to_pair(room.bars.pairs, world, row, of_depth)
+        add_to_material(room.bars.materials, world, near.contact, by_material)
+        add_to_material(room.bars.materials, world, near.contact, by.material)
     return whole
-
-
-@wp.func
-def touching_of(scene: wp.ref[Scene], world: int, found: FoundPair) -> Touching:
-    """What the samples of a pair depend on, without its pose, and with all of the restitution."""
-    pair = numbers_of(scene, world, found.pair)
-    at = Touching()
-    at.share = found.share
-    at.timestep = scene.timestep[world, 0]
-    at.stiffness_share = pair.share
-    at.depth = pair.impact_depth
-    at.rests = left_out(found, pair.factor)
-    at.material = scene.materials[world, scene.pair_index[found.pair].contact]
-    at.impact = found.impact
-    return at
-
-
-@wp.func
-def add_to_depths(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair, by: Touching, bar: real
-) -> real:
-    """Add derivatives by a pair's depths; returns the one by the depth beside what it rests on.
-
-    `bar` is that by the depth at which the bodies meet, whichever that is.
-    """
-    pair = numbers_of(scene, world, found.pair)
-    row = scene.pair_index[found.pair].row
-    beside = real(0.0)
-    room.bars.pairs[world, row].share += by.stiffness_share
-    room.bars.pairs[world, row].impact_depth += by.depth + by.impact.depth
-    room.bars.pairs[world, row].deepest += by.impact.deepest
-    if found.hits > 0 and wp.length_sq(found.support) > ZERO:
-        beside = bar
-    elif found.hits > 0 or pair.impact_depth > pair.sink:
-        room.bars.pairs[world, row].impact_depth += bar
-    else:
-        room.bars.pairs[world, row].sink += bar
-    return beside
 
 
 @after_adjoints
@@ -376,22 +543,21 @@ def pull_waiting(
     found: FoundPair,
     twists: Virtual,
     waiting: Waiting,
-    bar: MetPair,
-) -> tuple[FoundPair, MetPair]:
-    """Derivatives by when and how a pair meets whose impulses wait, and those by its bodies with them.
+    bar: wp.ref[MetPair],
+) -> FoundPair:
+    """Derivatives by when and how a pair meets whose impulses wait; adds those by its bodies.
 
-    `bar` has those by when impulses on its bodies take effect, of its own: they are known by then.
+    `bar` has those by when impulses on its bodies take effect, of its own, which are used up: it is known.
     """
     own = waiting
     own.met += bar.first.met + bar.second.met
-    whole = bar
-    whole.first.met = ZERO
-    whole.second.met = ZERO
+    bar.first.met = ZERO
+    bar.second.met = ZERO
     apart = apart_at_start(scene, room, world, found)
     by_found, by_apart, _a, _b = wp.grad(waiting_work)(found, apart, twists, own)
-    whole.first.position += by_apart
-    whole.second.position -= by_apart
-    return by_found, whole
+    bar.first.position += by_apart
+    bar.second.position -= by_apart
+    return by_found
 
 
 @after_adjoints
@@ -410,58 +576,62 @@ def pull_pair(
 
     `rebound` is the share of the restitution that counts.
     """
-    index = scene.pair_index[found.pair]
     near = near_pair(scene, world, found.pair)
-    pair = near.numbers
-    turning = near.turning
-    h = near.h
-    a, b = as_they_meet(room.bodies[world, index.first], room.bodies[world, index.second], found, h)
-    at = met_pair(scene, world, found, a, b, found.share, found.toward)
-    samples = touching_of(scene, world, found)
-    samples.pose = posed(scene, world, near, a, b, found.share)
-    samples.pose.com_difference = found.com_difference
-    restores = ONE
-    if samples.material.instant > ZERO:
-        restores = rebound
-    samples.material.restitution = restores * samples.material.restitution
+    a, b = as_they_meet(room.bodies[world, near.first], room.bodies[world, near.second], found, near.h)
+    at = met_pair(scene, world, near, a, b, found.share, found.toward)
+    material = scene.materials[world, near.contact]
+    samples = touching_of(scene, world, found, near, at)
+    restores = wp.where(material.instant > ZERO, rebound, ONE)
+    samples.material.restitution = restores * material.restitution
     asked = Asked()
-    by, by_twists = pull_samples(scene, room, world, lane, _PRESSES, found, samples, twists, asked)
+    by, by_twists = pull_samples(scene, room, world, lane, PRESSES, found, samples, twists, asked)
     by.material.restitution = restores * by.material.restitution
     by.rests = by.impact.rests
-    factor_bar = by.impact.factor
-    bar, _j = wp.grad(apart_work)(at, by.pose.com_difference)
+    by.impact.rests = ZERO
+    bar = MetPair()
+    by_a, by_b, by_h, _a = wp.grad(apart_work)(a, b, near.h, by.pose.com_difference)
+    bar.first = by_a
+    bar.second = by_b
+    bar.timestep = by_h
     support_bar = vec6()
     if found.impact.share > ZERO:
-        hits = found.impact.stiffness > ZERO
-        alone = bool(False)
+        coming = Coming()
+        coming.waits = found.impact.delays > ZERO
         if wp.static(not TREES):
-            alone = scene.body_index[index.first].row < 0 or scene.body_index[index.second].row < 0
-            if hits:
-                by_found, bar = pull_waiting(scene, room, world, found, twists, waiting, bar)
-                by.impact.delays += by_found.impact.delays
-                by.share += by_found.share
-                support_bar = by_found.support
-        by_impact, by_patch, by_material, by_factor, _d, _e, _f, _g, _h = wp.grad(impact_work)(
-            at, found.patch, scene.materials[world, index.contact], pair.factor, turning, hits, alone,
-            found.impact.delays > ZERO, by.impact,
-        )  # fmt: skip
-        asked.patch = by_patch
-        of_patch, _i = pull_samples(scene, room, world, lane, _MEETS, found, samples, twists, asked)
+            coming.alone = scene.body_index[near.first].row < 0 or scene.body_index[near.second].row < 0
+            if found.impact.stiffness > ZERO:
+                by_met = pull_waiting(scene, room, world, found, twists, waiting, bar)
+                by.impact.delays += by_met.impact.delays
+                by.share += by_met.share
+                support_bar = by_met.support
+        by_first, by_second, by_material, by_found, by_near, _b, _c = wp.grad(impact_work)(
+            a, b, material, found, near, coming, by.impact
+        )
+        asked.patch = by_found.patch
+        of_patch, _d = pull_samples(scene, room, world, lane, MEETS, found, samples, twists, asked)
         add_to_touching(by, of_patch)
         # What follows from when they meet is left to where that is.
-        by.share += by_impact.share
-        by_impact.share = ZERO
-        add_to_met(bar, by_impact)
-        factor_bar += by_factor
-        if lane == 0:
-            add_to_material(room.bars.materials, world, index.contact, by_material)
+        by.share += by_found.share
+        add_to_state(bar.first, by_first)
+        add_to_state(bar.second, by_second)
+        bar.timestep += by_near.h
+        by.numbers.factor += by_near.numbers.factor
+        add_material(by.material, by_material)
     depth_bar = real(0.0)
     if lane == 0:
-        of_pose, depth_bar = pull_pose(scene, room, world, lane, found, at, samples.pose, by)
+        of_pose, depth_bar = pull_pose(scene, room, world, lane, found.critical, near.second, at, by)
         add_to_met(bar, of_pose)
-        add_to_material(room.bars.materials, world, index.contact, by.material)
-        room.bars.pairs[world, index.row].factor += factor_bar
-        depth_bar = add_to_depths(scene, room, world, found, by, depth_bar)
+        add_to_material(room.bars.materials, world, near.contact, by.material)
+        by.numbers.impact_depth += by.impact.depth
+        by.numbers.deepest += by.impact.deepest
+        by.numbers.factor += by.impact.factor
+        # How deep they meet: beside what they rest on `pull_support` says it.
+        if wp.length_sq(found.support) == ZERO:
+            if found.hits > 0 or near.numbers.impact_depth > near.numbers.sink:
+                by.numbers.impact_depth += depth_bar
+            else:
+                by.numbers.sink += depth_bar
+        add_to_pair(room.bars.pairs, world, scene.pair_index[found.pair].row, by.numbers)
     else:
         bar = MetPair()
     if wp.static(not TREES):

@@ -3,15 +3,8 @@
 import warp as wp
 
 from dano.engine.kernels.assembly import twist_of
-from dano.engine.kernels.derivatives.adjoint import (
-    advance_work,
-    MetPair,
-    momentum_work,
-    state_work,
-    Virtual,
-    Waiting,
-)
-from dano.engine.kernels.derivatives.contact import add_to_state, pull_pair
+from dano.engine.kernels.derivatives.bodies import pull_ends, pull_momenta, pull_states
+from dano.engine.kernels.derivatives.contact import add_to_state, MetPair, pull_pair, Virtual, Waiting
 from dano.engine.kernels.derivatives.patches import pull_patch
 from dano.engine.kernels.derivatives.trees import (
     add_hanging,
@@ -27,8 +20,8 @@ from dano.engine.kernels.derivatives.trees import (
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.linear_solve import copy_blocks, copy_transposed_blocks, EVERYWHERE, solve_blocks
 from dano.engine.kernels.rollout import Launch, push_of, row_before
-from dano.engine.kernels.settled import block_of, hangs
-from dano.engine.kernels.tables import FoundPair, Room, Scene, StateRow
+from dano.engine.kernels.settled import hangs, settle
+from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals, solve_trees
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.pairs import BodyState
@@ -36,56 +29,40 @@ from dano.physics.real import ONE, vec6, ZERO
 from dano.physics.structures import after_adjoints, product_of
 
 _LANES = wp.constant(LANES)
-body_product, row_product = product_of(BodyState), product_of(StateRow)
 waiting_product = product_of(Waiting)
 
 
-@wp.func
-def pull_body(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int):
-    """Add derivatives by a body's row and properties from those by its state, which are used up."""
-    bar = room.body_bars[world, i]
-    if not (body_product(bar, bar) == ZERO):
-        _a, _b, _c, _d, _e = wp.grad(state_work)(room.given, world, i, scene.body_index[i].row >= 0, bar)
-        room.body_bars[world, i] = BodyState()
+@wp.struct
+class SettledStep:
+    """A step at its solution, as a lane sees it."""
+
+    world: int
+    lane: int
+    t: int  # Number of the step
+    n_found: int  # Number of pairs with points
 
 
 @wp.func
-def pull_momentum(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int):
-    """Add derivatives through the momentum that a body comes with, gravity and control."""
-    b = block_of(scene, scene.body_index[i].row)
-    _a, _b, _c, _d, _e = wp.grad(momentum_work)(
-        room.given, world, i, room.velocity[world, b], room.step[world, b]
-    )
-
-
-@wp.func
-def pull_advance(scene: wp.ref[Scene], room: wp.ref[Room], world: int, i: int, after: StateRow):
-    """Derivatives by the velocities and the row of a body from those by its row at the end of a step."""
-    m = scene.body_index[i].row
-    if m < 0:
-        room.bars.state[world, i] = after
-        return
-    b = block_of(scene, m)
-    room.residual[world, b] = vec6()
-    if not (row_product(after, after) == ZERO):
-        _a, _b, _c, by_velocity, _e = wp.grad(advance_work)(
-            room.given, world, i, room.velocity[world, b], after
-        )
-        room.residual[world, b] = by_velocity
-
-
-@wp.func
-def take_step(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, t: int):
-    """What a step is given that others are not: its start and its controls, in `room.given`."""
-    for i in range(scene.body_index.shape[0]):
-        room.given.state[world, i] = row_before(scene, launch, world, t, i)
-        room.given.pushes[world, i] = push_of(scene, launch, world, t, i)
-    for c in range(scene.trees.coordinates.shape[0]):
-        drive = room.trees.joints[world, c].drive
-        room.given_trees.q[world, c] = drive.q
-        room.given_trees.v[world, c] = drive.v
-        room.given_trees.efforts[world, c] = drive.effort
-        room.given_trees.commands[world, c] = drive.command
+def settled_step(
+    scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], world: int, lane: int, t: int
+) -> SettledStep:
+    """A step at its solution; what only it is given, its start and its controls, in `room.given`."""
+    step = SettledStep()
+    step.world = world
+    step.lane = lane
+    step.t = t
+    step.n_found = settle(scene, room, launch, world, lane, t)
+    if lane == 0:
+        for i in range(scene.body_index.shape[0]):
+            room.given.state[world, i] = row_before(scene, launch, world, t, i)
+            room.given.pushes[world, i] = push_of(scene, launch, world, t, i)
+        for c in range(scene.trees.coordinates.shape[0]):
+            drive = room.trees.joints[world, c].drive
+            room.given_trees.q[world, c] = drive.q
+            room.given_trees.v[world, c] = drive.v
+            room.given_trees.efforts[world, c] = drive.effort
+            room.given_trees.commands[world, c] = drive.command
+    return step
 
 
 @wp.func
@@ -117,12 +94,6 @@ def solve_settled(
 
 
 @wp.func
-def is_moved(values: wp.array2d(dtype=vec6), world: int, block: int) -> bool:
-    """Whether virtual velocities in a block are not zero; what is not a number is not."""
-    return not (wp.length_sq(values[world, block]) == ZERO)
-
-
-@wp.func
 def add_to_body(
     scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, bar: BodyState, twist: vec6, work: vec6
 ):
@@ -147,28 +118,17 @@ def add_pair(
 
 @after_adjoints
 @wp.func
-def pull_end(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    launch: wp.ref[Launch],
-    world: int,
-    lane: int,
-    t: int,
-):
+def pull_end(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], step: SettledStep):
     """Derivatives by what a step begins with, and by its velocities, from those by its end.
 
     The latter are in `room.residual`. Chains are those without virtual velocities, see `follow_chains`.
     """
-    if lane == 0:
-        for i in range(scene.body_index.shape[0]):
-            room.bars.state[world, i] = StateRow()
-            room.body_bars[world, i] = BodyState()
+    world = step.world
+    if step.lane == 0:
         if wp.static(TREES):
             clear_trees(scene, world, room.residual)
-            pull_places(scene, room, launch, world, t)
-        for i in range(scene.body_index.shape[0]):
-            if not hangs(scene, scene.body_index[i].row):
-                pull_advance(scene, room, world, i, room.after_bar[world, i])
+            pull_places(scene, room, launch, world, step.t)
+        pull_ends(scene, room, world)
         if wp.static(TREES):
             ask_of_end(scene, room, world)
             pull_coordinates(scene, room, world)
@@ -201,67 +161,62 @@ def waiting_bars(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: Fo
     """A pair's part of derivatives by when impulses on its bodies take effect, and by what carries them."""
     bars = Waiting()
     if wp.static(not TREES):
-        index = scene.pair_index[found.pair]
-        if found.waits > 0 and scene.body_index[index.first].row >= 0:
-            bars.first_support = room.body_bars[world, index.first].support
-            add_meeting(scene, room, world, index.first, bars)
-        if found.waits > 0 and scene.body_index[index.second].row >= 0:
-            bars.second_support = room.body_bars[world, index.second].support
-            add_meeting(scene, room, world, index.second, bars)
+        if found.waits > 0:
+            index = scene.pair_index[found.pair]
+            bars.first_support = add_meeting(scene, room, world, index.first, bars)
+            bars.second_support = add_meeting(scene, room, world, index.second, bars)
     return bars
 
 
 @wp.func
-def add_meeting(scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, bars: wp.ref[Waiting]):
-    """Add one impulse's part of derivatives by when all that wait on a body take effect, the mean of them."""
-    count = room.meetings[world, scene.body_index[body].row][0]
-    bars.met += room.body_bars[world, body].met / count
-    bars.lead += room.body_bars[world, body].lead / count
+def add_meeting(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, body: int, bars: wp.ref[Waiting]
+) -> vec6:
+    """Add one impulse's part of derivatives by when all that wait on a body take effect, the mean of them.
+
+    Returns:
+        Those by what carries the body.
+    """
+    bar = room.body_bars[world, body]
+    row = scene.body_index[body].row
+    if row < 0:
+        return vec6()
+    count = room.meetings[world, row][0]
+    bars.met += bar.met / count
+    bars.lead += bar.lead / count
+    return bar.support
 
 
 @after_adjoints
 @wp.func
-def pull_equations(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    launch: wp.ref[Launch],
-    world: int,
-    lane: int,
-    t: int,
-    n_found: int,
-):
+def pull_equations(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], step: SettledStep):
     """Add derivatives of −λ · R of a settled step, with virtual velocities λ in `room.step`."""
-    n = scene.body_index.shape[0]
+    world = step.world
+    lane = step.lane
     if lane == 0:
-        for i in range(n):
-            row = scene.body_index[i].row
-            if row >= 0 and not hangs(scene, row) and is_moved(room.step, world, block_of(scene, row)):
-                pull_momentum(scene, room, world, i)
+        pull_momenta(scene, room, world)
     wait()
     # When impulses take effect matters to all contact of a body: what has them wait comes last.
-    for k in range(2 * n_found):
-        entry = (k % n_found) * _LANES + lane
-        if (room.found[world, entry].waits > 0) == (k >= n_found):
+    for k in range(2 * step.n_found):
+        entry = (k % step.n_found) * _LANES + lane
+        if (room.found[world, entry].waits > 0) == (k >= step.n_found):
             found = room.found[world, entry]
             twists = twists_of_pair(scene, room, world, entry)
             waiting = waiting_bars(scene, room, world, found)
             if is_moved_pair(twists) or not (waiting_product(waiting, waiting) == ZERO):
-                rebound = launch.reports[world, t].rebound
+                rebound = launch.reports[world, step.t].rebound
                 bar, by_twists = pull_pair(scene, room, world, lane, found, rebound, twists, waiting)
                 if lane == 0:
                     add_pair(scene, room, world, found, bar, by_twists)
             wait()
     if wp.static(PATCHES):
         for p in range(room.patches.count[world, 0]):
-            touching = room.found[world, (n_found + p) * _LANES + lane]
-            twists_there = twists_of_pair(scene, room, world, (n_found + p) * _LANES + lane)
+            touching = room.found[world, (step.n_found + p) * _LANES + lane]
+            twists_there = twists_of_pair(scene, room, world, (step.n_found + p) * _LANES + lane)
             if is_moved_pair(twists_there):
                 by = pull_patch(scene, room, world, lane, touching, twists_there)
                 if lane == 0:
-                    index = scene.pair_index[touching.pair]
-                    none = BodyState()
-                    add_to_body(scene, room, world, index.first, none, by.first, by.first_virtual)
-                    add_to_body(scene, room, world, index.second, none, by.second, by.second_virtual)
+                    add_pair(scene, room, world, touching, MetPair(), by)
     wait()
     if lane == 0:
         if wp.static(TREES):
@@ -269,6 +224,5 @@ def pull_equations(
             pull_laws(scene, room, world)
             pull_loops(scene, room, world)
             pull_chains(scene, room, world)
-        for i in range(n):
-            pull_body(scene, room, world, i)
+        pull_states(scene, room, world)
     wait()

@@ -7,10 +7,9 @@ samples and maps of where a density is positive, has no derivatives.
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import Virtual
-from dano.engine.kernels.derivatives.contact import add_part, add_to_leaf, n_moving, pull_distance
+from dano.engine.kernels.derivatives.contact import add_part, add_to_leaf, n_moving, pull_distance, Virtual
 from dano.engine.kernels.lanes import total_of, wait
-from dano.engine.kernels.patch_tables import PatchContact, PatchSideIndex, PatchTables
+from dano.engine.kernels.patch_tables import PatchContact, PatchTables
 from dano.engine.kernels.patches import contact_of, frame_of, next_block, side_field
 from dano.engine.kernels.tables import BLOCK, FoundPair, Given, GivenPatches, Room, Scene
 from dano.physics.features import KINDS, LANES
@@ -46,11 +45,7 @@ from dano.physics.twists import relative_twist
 
 @wp.func
 def patch_of_sides(
-    given: Given,
-    patches: GivenPatches,
-    tables: PatchTables,
-    world: int,
-    contact: PatchContact,
+    given: Given, patches: GivenPatches, tables: PatchTables, world: int, contact: PatchContact
 ) -> Patch:
     """The patch of a contact from the sums over the samples of its sides."""
     patch = Patch()
@@ -88,12 +83,7 @@ def patch_of_sides(
 
 @wp.func
 def patch_work(
-    given: Given,
-    patches: GivenPatches,
-    tables: PatchTables,
-    world: int,
-    c: int,
-    twists: Virtual,
+    given: Given, patches: GivenPatches, tables: PatchTables, world: int, c: int, twists: Virtual
 ) -> real:
     """Work of the impulse of a patch along the virtual velocities of its bodies."""
     contact = tables.contacts[c]
@@ -146,11 +136,8 @@ def pull_place(
     """Derivative by a point in a field's frame from one by the density there; adds those by the field."""
     leading = densest(scene.solids, scene.patches.fields, world, field, x)
     solid = leading.solid
-    found = vec3()
-    is_grid = bool(False)
     if wp.static(DENSITY in KINDS):
-        is_grid = solid.kind.kind == _DENSITY
-        if is_grid:
+        if solid.kind.kind == _DENSITY:
             _a, _b, by_grid, by_place, _c = wp.grad(grid_work)(scene.solids, world, solid, x, bar)
             add_to_leaf(room.bars.leaves, world, solid.first, by_grid.leaf)
             for k in range(n_moving(scene, room)):
@@ -158,78 +145,54 @@ def pull_place(
                 moved = moved_solids(scene.solids)
                 change = grid_density(moved, world, kind, solid.leaf, in_leaf(solid.leaf, x))
                 add_part(room, world, lane, k, density_product(bar, change))
-            found = by_place
-    if not is_grid:
-        d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
-        by_part, _d, by_solid, by_x, by_d, _e = wp.grad(shell_work)(
-            leading.part, leading.kind, solid, x, d, bar
-        )
-        room.bars.parts[world, leading.first].edge += by_part.edge
-        add_to_leaf(room.bars.leaves, world, solid.first, by_solid.leaf)
-        found = by_x + pull_distance(scene, room, world, lane, solid, x, by_d)
-    return found
+            return by_place
+    d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
+    by_part, _d, by_solid, by_x, by_d, _e = wp.grad(shell_work)(leading.part, leading.kind, solid, x, d, bar)
+    room.bars.parts[world, leading.first].edge += by_part.edge
+    add_to_leaf(room.bars.leaves, world, solid.first, by_solid.leaf)
+    return by_x + pull_distance(scene, room, world, lane, solid, x, by_d)
 
 
 @wp.func
-def pull_weighted(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    world: int,
-    lane: int,
-    index: PatchSideIndex,
-    field: Field,
-    view: View,
-    bar: Sums,
-) -> View:
-    """Derivative by how samples see a field, from one by their sums; adds those by samples and the field."""
-    found = View()
+def pull_side(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, s: int):
+    """Add derivatives through the sums over the samples of a side."""
+    index = scene.patches.side_index[s]
+    field = side_field(scene, world, index)
+    sampled = frame_of(room.bodies[world, index.sampled])
+    view = view_of(field, sampled, frame_of(room.bodies[world, index.queried]))
+    bar = room.patches.sum_bars[world, s]
+    by_view = View()
     i = next_block(scene, world, index, field, view, lane)
     while i < index.blocks:
-        b = index.first_block + i
-        for s in range(_BLOCK * b, _BLOCK * b + _BLOCK):
-            sample = scene.patches.samples[world, s]
+        begin = _BLOCK * (index.first_block + i)
+        for k in range(begin, begin + _BLOCK):
+            sample = scene.patches.samples[world, k]
             density = seen_density(scene.solids, scene.patches.fields, world, field, view, sample.point)
             if density.value > ZERO:
                 by_sample, by_density, _a = wp.grad(sample_sums_work)(sample, density, bar)
                 by_point = by_sample.point
                 if view.is_plane:
-                    by_view, by_edge, of_point, _b = wp.grad(plane_work)(
+                    of_plane, by_edge, of_point, _b = wp.grad(plane_work)(
                         view, field.part.edge, sample.point, by_density
                     )
                     room.bars.parts[world, field.first].edge += by_edge
-                    add_to_view(found, by_view)
+                    add_to_view(by_view, of_plane)
                     by_point += of_point
                 else:
                     # x = rotation · point + origin
                     x = view.rotation * sample.point + view.origin
                     by_x = pull_place(scene, room, world, lane, field, x, by_density)
-                    found.rotation += wp.outer(by_x, sample.point)
-                    found.origin += by_x
+                    by_view.rotation += wp.outer(by_x, sample.point)
+                    by_view.origin += by_x
                     by_point += wp.transpose(view.rotation) * by_x
                 if room.bars.weighted.shape[1] > 0:
-                    room.bars.weighted[world, s].point += by_point
-                    room.bars.weighted[world, s].weight += by_sample.weight
+                    room.bars.weighted[world, k].point += by_point
+                    room.bars.weighted[world, k].weight += by_sample.weight
         i = next_block(scene, world, index, field, view, i + _LANES)
-    return total_view(found)
-
-
-@wp.func
-def pull_side(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, s: int):
-    """Add derivatives through the samples of a side."""
-    index = scene.patches.side_index[s]
-    field = side_field(scene, world, index)
-    sampled = frame_of(room.bodies[world, index.sampled])
-    view = view_of(field, sampled, frame_of(room.bodies[world, index.queried]))
-    by_view = pull_weighted(scene, room, world, lane, index, field, view, room.patches.sum_bars[world, s])
+    by_view = total_view(by_view)
     if lane == 0:
-        _a, _b, _c, _d, _e, _f, _g = wp.grad(view_work)(
-            room.given,
-            room.given_patches,
-            world,
-            index.sampled,
-            index.queried,
-            field,
-            by_view,
+        _c, _d, _e, _f, _g, _h, _i = wp.grad(view_work)(
+            room.given, room.given_patches, world, index.sampled, index.queried, field, by_view
         )
 
 

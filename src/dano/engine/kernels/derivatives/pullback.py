@@ -2,11 +2,10 @@
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.equations import pull_end, pull_equations, solve_settled, take_step
+from dano.engine.kernels.derivatives.equations import pull_end, pull_equations, settled_step, solve_settled
 from dano.engine.kernels.derivatives.trees import follow_chains
 from dano.engine.kernels.lanes import wait
 from dano.engine.kernels.rollout import Launch
-from dano.engine.kernels.settled import settle
 from dano.engine.kernels.tables import Ends, Room, Scene
 from dano.engine.kernels.trees.balance import clear_trees
 from dano.physics.features import LANES, TREES
@@ -37,26 +36,25 @@ def pullback(scene: Scene, room: Room, launch: Launch, ends: Ends):
     m = ends.controls.shape[1] // launch.n_steps
     for s in range(launch.n_steps):
         t = launch.n_steps - 1 - s
-        n_found = settle(scene, room, launch, world, lane, t)
+        step = settled_step(scene, room, launch, world, lane, t)
         for i in range(lane, n, _LANES):
             ends.after[world, i] = ends.after[world, i] + ends.ends[world, t * n + i]
         for i in range(lane, m, _LANES):
             ends.bars[world, n + i] = ZERO
         wait()
         if lane == 0:
-            take_step(scene, room, launch, world, t)
             if wp.static(TREES):
                 clear_trees(scene, world, room.step)
                 follow_chains(scene, room, world)
         wait()
-        pull_end(scene, room, launch, world, lane, t)
+        pull_end(scene, room, launch, step)
         # Virtual velocities λ, (∂R/∂V)ᵀ λ = V̄.
         if lane == 0:
             for b in range(scene.n_blocks):
                 room.step[world, b] = room.residual[world, b]
         wait()
         solve_settled(scene, room, world, lane, True, False)
-        pull_equations(scene, room, launch, world, lane, t, n_found)
+        pull_equations(scene, room, launch, step)
         # The start of a step is the end of the one before; its controls belong to it alone.
         for i in range(lane, n, _LANES):
             ends.after[world, i] = ends.bars[world, i]

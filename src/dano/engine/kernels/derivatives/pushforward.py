@@ -8,20 +8,20 @@ directions.
 
 import warp as wp
 
+from dano.engine.kernels.derivatives.bodies import body_product
 from dano.engine.kernels.derivatives.contact import add_part
 from dano.engine.kernels.derivatives.equations import (
-    body_product,
     pull_end,
     pull_equations,
+    settled_step,
+    SettledStep,
     solve_settled,
-    take_step,
 )
 from dano.engine.kernels.derivatives.pullback import begin
 from dano.engine.kernels.derivatives.trees import ask_of_end, follow_chains
 from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.patches import contact_of, n_patches
 from dano.engine.kernels.rollout import Launch
-from dano.engine.kernels.settled import settle
 from dano.engine.kernels.tables import BLOCK, Ends, FoundPair, Room, Scene
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.overlap import WeightedSample
@@ -33,14 +33,6 @@ from dano.physics.structures import after_adjoints, product_of
 _LANES, _BLOCK = wp.constant(LANES), wp.constant(BLOCK)
 
 sample_product, weighted_product = product_of(Sample), product_of(WeightedSample)
-
-
-@wp.func
-def unit_vector(k: int) -> vec6:
-    """The k-th unit vector."""
-    unit = vec6()
-    unit[k] = ONE
-    return unit
 
 
 @wp.func
@@ -89,15 +81,11 @@ def use_weighted(
 
 @wp.func
 def change_along(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    launch: wp.ref[Launch],
-    ends: wp.ref[Ends],
-    world: int,
-    lane: int,
-    n_found: int,
+    scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], ends: wp.ref[Ends], step: SettledStep
 ):
     """What the changes in each direction make of a number, in `room.along`; its derivatives are used up."""
+    world = step.world
+    lane = step.lane
     n = ends.bars.shape[1]
     wait()
     for i in range(lane, n, _LANES):
@@ -107,11 +95,11 @@ def change_along(
             for d in range(launch.n_directions):
                 add_part(room, world, lane, d, bar * room.moving[world, d * n + i])
     if room.bars.samples.shape[1] > 0:
-        for f in range(n_found):
+        for f in range(step.n_found):
             use_samples(room, ends, world, lane, room.found[world, f * _LANES + lane])
     if wp.static(PATCHES):
         if room.bars.weighted.shape[1] > 0:
-            for f in range(n_found, n_found + n_patches(room, world)):
+            for f in range(step.n_found, step.n_found + n_patches(room, world)):
                 use_weighted(scene, room, ends, world, lane, room.found[world, f * _LANES + lane])
     for d in range(launch.n_directions):
         change = total(room.lane_sums[world, d * _LANES + lane])
@@ -120,27 +108,14 @@ def change_along(
     wait()
 
 
-@wp.func
-def used_of(scene: wp.ref[Scene], block: int) -> int:
-    """Unknowns in a block."""
-    if wp.static(TREES):
-        return scene.trees.blocks[block].used
-    return 6
-
-
 @after_adjoints
 @wp.func
 def push_equations(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    launch: wp.ref[Launch],
-    ends: wp.ref[Ends],
-    world: int,
-    lane: int,
-    t: int,
-    n_found: int,
+    scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], ends: wp.ref[Ends], step: SettledStep
 ):
     """Changes of the velocities of a settled step, in all directions, in `room.missing`."""
+    world = step.world
+    lane = step.lane
     m = scene.n_blocks
     if lane == 0:
         for i in range(launch.n_directions * m):
@@ -150,16 +125,19 @@ def push_equations(
     while block < m:
         clear_bars(scene, room, ends, world, lane)
         if lane == 0:
-            room.step[world, block] = unit_vector(k)
+            room.step[world, block][k] = ONE
         wait()
-        pull_equations(scene, room, launch, world, lane, t, n_found)
-        change_along(scene, room, launch, ends, world, lane, n_found)
+        pull_equations(scene, room, launch, step)
+        change_along(scene, room, launch, ends, step)
         if lane == 0:
             for d in range(launch.n_directions):
-                room.missing[world, d * m + block] += room.along[world, d] * unit_vector(k)
+                room.missing[world, d * m + block][k] = room.along[world, d]
         wait()
         k += 1
-        if k >= used_of(scene, block):
+        used = int(6)
+        if wp.static(TREES):
+            used = scene.trees.blocks[block].used
+        if k >= used:
             block += 1
             k = 0
     for d in range(launch.n_directions):
@@ -187,16 +165,11 @@ def is_late(scene: wp.ref[Scene], room: wp.ref[Room], world: int) -> bool:
 @after_adjoints
 @wp.func
 def push_end(
-    scene: wp.ref[Scene],
-    room: wp.ref[Room],
-    launch: wp.ref[Launch],
-    ends: wp.ref[Ends],
-    world: int,
-    lane: int,
-    t: int,
-    n_found: int,
+    scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch], ends: wp.ref[Ends], step: SettledStep
 ):
     """Changes of a step's end in all directions, from those of its velocities in `room.missing`."""
+    world = step.world
+    lane = step.lane
     n = ends.after.shape[1]
     m = scene.n_blocks
     clear_bars(scene, room, ends, world, lane)
@@ -215,11 +188,11 @@ def push_end(
             if lane == 0:
                 ends.after[world, number] = ONE
             wait()
-            pull_end(scene, room, launch, world, lane, t)
+            pull_end(scene, room, launch, step)
             if wp.static(not TREES):
                 if is_late(scene, room, world):
-                    pull_equations(scene, room, launch, world, lane, t, n_found)
-            change_along(scene, room, launch, ends, world, lane, n_found)
+                    pull_equations(scene, room, launch, step)
+            change_along(scene, room, launch, ends, step)
         if lane == 0:
             for d in range(launch.n_directions):
                 change = room.moving[world, d * ends.bars.shape[1] + number]
@@ -227,7 +200,7 @@ def push_end(
                     change = room.along[world, d]
                     for b in range(m):
                         change += wp.dot(room.residual[world, b], room.missing[world, d * m + b])
-                ends.ends[world, (d * launch.n_steps + t) * n + number] = change
+                ends.ends[world, (d * launch.n_steps + step.t) * n + number] = change
         wait()
         number += 1
 
@@ -251,17 +224,15 @@ def pushforward(scene: Scene, room: Room, launch: Launch, ends: Ends):
     n = ends.after.shape[1]
     m = ends.controls.shape[1] // (launch.n_directions * launch.n_steps)
     for t in range(launch.n_steps):
-        n_found = settle(scene, room, launch, world, lane, t)
-        if lane == 0:
-            take_step(scene, room, launch, world, t)
+        step = settled_step(scene, room, launch, world, lane, t)
         for d in range(launch.n_directions):
             at = d * ends.bars.shape[1]
-            step = d * launch.n_steps + t
+            row = d * launch.n_steps + t
             if t > 0:
                 for i in range(lane, n, _LANES):
-                    room.moving[world, at + i] = ends.ends[world, (step - 1) * n + i]
+                    room.moving[world, at + i] = ends.ends[world, (row - 1) * n + i]
             for i in range(lane, m, _LANES):
-                room.moving[world, at + n + i] = ends.controls[world, step * m + i]
+                room.moving[world, at + n + i] = ends.controls[world, row * m + i]
         wait()
-        push_equations(scene, room, launch, ends, world, lane, t, n_found)
-        push_end(scene, room, launch, ends, world, lane, t, n_found)
+        push_equations(scene, room, launch, ends, step)
+        push_end(scene, room, launch, ends, step)

@@ -1,13 +1,12 @@
 """Derivatives of bodies on joints: sweeps from the tips of trees to their roots (docs/gradients.md).
 
 A body on a joint stands and moves as the body that carries it says: each joint is a function from one `Chain`
-to the next, and derivatives go through it from the tips to the roots. What is differentiated stands
-first: see `dano.engine.kernels.derivatives.adjoint`.
+to the next, and derivatives go through it from the tips to the roots. What is differentiated stands first.
 """
 
 import warp as wp
 
-from dano.engine.kernels.derivatives.adjoint import momentum_gained
+from dano.engine.kernels.derivatives.bodies import momentum_gained
 from dano.engine.kernels.rollout import Launch
 from dano.engine.kernels.tables import Given, GivenTrees, Room, Scene, StateRow
 from dano.engine.kernels.trees.kinematics import unknown_of, velocities_of
@@ -16,7 +15,7 @@ from dano.engine.kernels.trees.tables import Chain, Coordinate, HangingBar, Loop
 from dano.physics.pairs import BodyState
 from dano.physics.real import ONE, quat, real, vec3, vec4, vec6, ZERO
 from dano.physics.rotations import from_wxyz, matrix, to_wxyz, turn_of_step
-from dano.physics.structures import need_adjoints, vjp_of
+from dano.physics.structures import adding_of, need_adjoints, vjp_of
 from dano.physics.trees.joint_laws import joint_momentum, joint_ramps, JointDrive, ramps_force
 from dano.physics.trees.joints import (
     BALL,
@@ -63,21 +62,13 @@ def chain_of(given: Given, trees: GivenTrees, world: int, node: int, body: int) 
 
 
 @wp.func
-def coordinate_of(values: wp.array2d(dtype=real), world: int, node: Node, part: int) -> real:
-    """A number of a coordinate of a joint; zero where it has fewer."""
-    if part >= node.width:
-        return ZERO
-    return values[world, node.coordinate + part]
-
-
-@wp.func
 def coordinates_of(values: wp.array2d(dtype=real), world: int, node: Node) -> vec3:
-    """Numbers of a joint's coordinates."""
-    return vec3(
-        coordinate_of(values, world, node, 0),
-        coordinate_of(values, world, node, 1),
-        coordinate_of(values, world, node, 2),
-    )
+    """Numbers of a joint's coordinates, zero where it has fewer."""
+    own = vec3()
+    for part in range(3):
+        if part < node.width:
+            own[part] = values[world, node.coordinate + part]
+    return own
 
 
 @wp.func
@@ -102,13 +93,7 @@ def root_chain(given: Given, world: int, body: int, y: vec6, virtual: vec6, orig
 
 @wp.func
 def hanging_chain(
-    given: Given,
-    trees: GivenTrees,
-    world: int,
-    node: Node,
-    y: vec3,
-    virtual: vec3,
-    origin: vec3,
+    given: Given, trees: GivenTrees, world: int, node: Node, y: vec3, virtual: vec3, origin: vec3
 ) -> Chain:
     """Of a body on a joint, with velocities y of its coordinates at the end [rad/s or m/s].
 
@@ -182,21 +167,16 @@ def hanging_body_work(
 
 @wp.func
 def placing_work(
-    given: Given,
-    trees: GivenTrees,
-    world: int,
-    node: Node,
-    carrier: Carrier,
-    q: vec3,
-    position: vec3,
-    orientation: vec4,
+    given: Given, trees: GivenTrees, world: int, node: Node, carries: StateRow, q: vec3, bar: StateRow
 ) -> real:
-    """⟨bars, pose of a body on a joint⟩; its carrier is without its centre of mass."""
-    carries = carrier
-    carries.com = com_of(given, world, node.carrier)
+    """⟨bars, pose of a body on a joint⟩ at the end of a step, where its carrier is then."""
+    carrier = Carrier()
+    carrier.position = carries.position
+    carrier.orientation = from_wxyz(carries.orientation)
+    carrier.com = com_of(given, world, node.carrier)
     com = com_of(given, world, node.body)
-    pose = hanging_pose(node.kind, trees.joints[world, node.joint], carries, com, q)
-    return wp.dot(position, pose.position) + wp.dot(orientation, to_wxyz(pose.orientation))
+    pose = hanging_pose(node.kind, trees.joints[world, node.joint], carrier, com, q)
+    return wp.dot(bar.position, pose.position) + wp.dot(bar.orientation, to_wxyz(pose.orientation))
 
 
 @wp.func
@@ -238,20 +218,15 @@ def coordinate_work(
 
 
 @wp.func
-def loop_end(chain: Chain) -> LoopEnd:
-    """An end of a loop at the start of a step."""
+def loop_end(chain: Chain, is_after: bool) -> LoopEnd:
+    """An end of a loop at the start of a step, or at its end."""
     end = LoopEnd()
-    end.position = chain.position
-    end.orientation = chain.orientation
-    return end
-
-
-@wp.func
-def loop_end_after(chain: Chain) -> LoopEnd:
-    """… at its end."""
-    end = LoopEnd()
-    end.position = chain.position + chain.after.shift
-    end.orientation = chain.after.turn * chain.orientation
+    if is_after:
+        end.position = chain.position + chain.after.shift
+        end.orientation = chain.after.turn * chain.orientation
+    else:
+        end.position = chain.position
+        end.orientation = chain.orientation
     return end
 
 
@@ -271,11 +246,11 @@ def loop_work(
     loop = trees.loops[world, row]
     first = chain_of(given, trees, world, index.first, index.first_body)
     second = chain_of(given, trees, world, index.second, index.second_body)
-    one = loop_end(first)
-    other = loop_end(second)
+    one = loop_end(first, False)
+    other = loop_end(second, False)
     moved = gap_by_twist(loop, one, one, twist_at(first.work, first.position - first_origin), False)
     moved += gap_by_twist(loop, one, other, twist_at(second.work, second.position - second_origin), True)
-    gap = loop_gap(loop, loop_end_after(first), loop_end_after(second))
+    gap = loop_gap(loop, loop_end(first, True), loop_end(second, True))
     return given.timestep[world, 0] * wp.dot(forces, moved) - wp.dot(virtual, gap)
 
 
@@ -286,6 +261,7 @@ for _function in (
 
 
 _BALL, _ROOT = wp.constant(BALL), wp.constant(ROOT)
+add_to_row = adding_of(StateRow)
 
 
 @wp.func
@@ -340,24 +316,6 @@ def add_hanging(room: wp.ref[Room], world: int, node: int, twist: vec6, work: ve
 
 
 @wp.func
-def pull_hanging(scene: wp.ref[Scene], room: wp.ref[Room], world: int, n: int):
-    """Add derivatives through a body on a joint and its joint, to what carries it."""
-    node = scene.trees.nodes[n]
-    origin = room.bodies[world, node.origin].position
-    _z, _a, _b, _c, _d, _e, _f, _g = wp.grad(hanging_body_work)(
-        room.given, room.given_trees, world, n, node.body, origin, room.trees.hanging_bars[world, n],
-        room.body_bars[world, node.body],
-    )  # fmt: skip
-    y = velocities_of(room.velocity, world, node)
-    virtual = velocities_of(room.step, world, node)
-    _z, _i, _j, _k, by_y, _m, _n, _o = wp.grad(hanging_work)(
-        room.given, room.given_trees, world, node, y, virtual, origin, room.trees.chain_bars[world, n]
-    )
-    add_unknowns(room.residual, world, node, by_y)
-    ask(room, world, node.parent)
-
-
-@wp.func
 def pull_chains(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
     """Add derivatives through how bodies of trees stand and move, which are used up.
 
@@ -369,31 +327,32 @@ def pull_chains(scene: wp.ref[Scene], room: wp.ref[Room], world: int):
         node = scene.trees.nodes[n]
         work = room.trees.chains[world, n].work
         if node.alone == 0 and (room.trees.asked[world, n] > 0 or not (wp.length_sq(work) == ZERO)):
+            origin = room.bodies[world, node.origin].position
             if node.kind == _ROOT:
                 b = node.place // 6
                 _a, _b, _c, by_velocity, _d, _e, _f = wp.grad(root_work)(
-                    room.given, world, node.body, room.velocity[world, b], room.step[world, b],
-                    room.bodies[world, node.origin].position, room.trees.chain_bars[world, n],
+                    room.given, world, node.body, room.velocity[world, b], room.step[world, b], origin,
+                    room.trees.chain_bars[world, n],
                 )  # fmt: skip
                 room.residual[world, b] = room.residual[world, b] + by_velocity
             else:
-                pull_hanging(scene, room, world, n)
+                # Through the body, then, with what that adds, through its joint to what carries it.
+                _g, _h, _i, _j, _k, _l, _m, _n = wp.grad(hanging_body_work)(
+                    room.given, room.given_trees, world, n, node.body, origin,
+                    room.trees.hanging_bars[world, n], room.body_bars[world, node.body],
+                )  # fmt: skip
+                y = velocities_of(room.velocity, world, node)
+                virtual = velocities_of(room.step, world, node)
+                _o, _p, _q, _r, by_y, _s, _t, _u = wp.grad(hanging_work)(
+                    room.given, room.given_trees, world, node, y, virtual, origin,
+                    room.trees.chain_bars[world, n],
+                )  # fmt: skip
+                add_unknowns(room.residual, world, node, by_y)
+                ask(room, world, node.parent)
                 room.body_bars[world, node.body] = BodyState()
             room.trees.chain_bars[world, n] = Chain()
             room.trees.hanging_bars[world, n] = HangingBar()
             room.trees.asked[world, n] = 0
-
-
-@wp.func
-def carrier_after(scene: wp.ref[Scene], launch: wp.ref[Launch], world: int, t: int, body: int) -> Carrier:
-    """What a joint hangs on at the end of a step, without its centre of mass."""
-    carrier = Carrier()
-    carrier.orientation = quat(ZERO, ZERO, ZERO, ONE)
-    if body >= 0:
-        row = launch.states[world, t * scene.body_index.shape[0] + body]
-        carrier.position = row.position
-        carrier.orientation = from_wxyz(row.orientation)
-    return carrier
 
 
 @wp.func
@@ -409,14 +368,15 @@ def pull_places(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Launch]
             first = t * scene.trees.coordinates.shape[0] + node.coordinate
             for part in range(node.width):
                 q[part] = launch.qs[world, first + part]
-            _z, _a, _b, _c, by_carrier, by_q, _d, _e = wp.grad(placing_work)(
-                room.given, room.given_trees, world, node,
-                carrier_after(scene, launch, world, t, node.carrier), q,
-                asked.position, asked.orientation,
-            )  # fmt: skip
+            carries = StateRow()
+            carries.orientation = vec4(ONE, ZERO, ZERO, ZERO)
             if node.carrier >= 0:
-                room.after_bar[world, node.carrier].position += by_carrier.position
-                room.after_bar[world, node.carrier].orientation += to_wxyz(by_carrier.orientation)
+                carries = launch.states[world, t * scene.body_index.shape[0] + node.carrier]
+            _z, _a, _b, _c, by_carrier, by_q, _d = wp.grad(placing_work)(
+                room.given, room.given_trees, world, node, carries, q, asked
+            )
+            if node.carrier >= 0:
+                add_to_row(room.after_bar[world, node.carrier], by_carrier)
             for part in range(node.width):
                 room.trees.q_after[world, node.coordinate + part] += by_q[part]
 
