@@ -65,23 +65,13 @@ class Bodies(NamedTuple):
         gain = self.gain[i] - self.gain[j] - np.cross(self.spin_gain[j], away)
         return gain, self.spin_gain[i] - self.spin_gain[j]
 
-    def falling(self, held):
-        """Bodies whose spins gain what gyroscopic torques add, but for those that are held, shape (n,)."""
-        ahead = np.where(held[:, None], self.ahead, self.ahead_falling)
-        return self._replace(ahead=ahead).held(held)
+    def falling(self):
+        """Bodies whose spins gain what gyroscopic torques add."""
+        return self._replace(ahead=self.ahead_falling)
 
-    def held(self, which=True):
-        """Bodies of which these gain no velocity, shape (n,) or all."""
-        gains = np.where(np.broadcast_to(which, self.mass.shape), 0, 1)[:, None]
-        return self._replace(
-            gain=gains * self.gain, spin_gain=gains * self.spin_gain, falls=gains * self.falls
-        )
-
-    def slow(self):
-        """Which bodies move by less than they fall in half a step, shape (n,)."""
-        radius = np.sqrt(3 * self.inverse_mass / np.maximum(np.trace(self.inverse_inertia.T), 1e-300))
-        speeds = np.linalg.norm(np.c_[self.velocity, radius[:, None] * self.spin], axis=1)
-        return self.moves & (speeds < 0.5 * np.linalg.norm(self.gain, axis=1))
+    def held(self):
+        """Bodies that gain no velocity."""
+        return self._replace(gain=0 * self.gain, spin_gain=0 * self.spin_gain, falls=0 * self.falls)
 
     def supported(self, impulses):
         """Bodies that fall and feel an impulse and its moment meanwhile [N s, N m s; W], shape (n, 6)."""

@@ -48,7 +48,6 @@ class Points(NamedTuple):
         drift: ½ ω⁻ × (r₁ − r₀), its tangential part limited [m/s], shape (n, 3).
         impact: κ w [Pa s/m], zero where there is no impact, shape (n,).
         kappa: κ [Pa s/m].
-        nearing: How fast samples that have sunk in or nearly have approach, in the mean [m/s].
         sunk: Depth where geometry is taken [m], shape (n,).
         delta: Depth of the impact [m].
         deepest: Depth that another part of the body may have, whose impact is left to the next step [m].
@@ -81,7 +80,6 @@ class Points(NamedTuple):
     drift: np.ndarray
     impact: np.ndarray
     kappa: float
-    nearing: float
     sunk: np.ndarray
     delta: float
     deepest: float
@@ -232,12 +230,7 @@ def depths_of(scene, side):
     (_, size, thickness) = np.minimum(*(np.asarray(scene.bodies[k].extent)[3:] for k in (side.i, side.j)))
     thin = 0.25 * thickness
     delta = min(side.law.delta, thin)
-    both_move = not (scene.bodies[side.i].fixed or scene.bodies[side.j].fixed)
-    return (
-        delta,
-        max(delta, min(0.01 * size, thin)),
-        max(delta, min((0.01 if both_move else 0.04) * size, thin)),
-    )
+    return delta, max(delta, min(0.01 * size, thin)), max(delta, min(0.04 * size, thin))
 
 
 class Meeting(NamedTuple):
@@ -259,12 +252,9 @@ def meetings(scene, bodies, side):
     if side.law.compliant:
         return lasting, lasting
     slow = side.law.slowest_rebound
-    raw, bodies = bodies, bodies.falling(held_of(scene, bodies, side))
-    since = 0.0 if scene.joints else -1.0
+    raw, bodies = bodies, bodies.falling()
+    since = -1.0 if is_alone(scene, bodies, side) else 0.0
     share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
-    if not is_alone(scene, bodies, side) and share <= -1:
-        since = 0.0
-        share = share_at(scene, bodies, side, delta, bodies.h * slow, slow, since)
     falls = nears(scene, bodies, side, delta, slow)
     support, left_out = np.zeros(6), 0.0
     if is_alone(scene, bodies, side) and share < 1 and falls:
@@ -387,14 +377,6 @@ def is_alone(scene, bodies, side):
     return not scene.joints and not (bodies.moves[side.i] and bodies.moves[side.j])
 
 
-def held_of(scene, bodies, side):
-    """Which bodies others hold, shape (n,): of two that move those that hardly do."""
-    held = np.zeros(len(bodies.mass), bool)
-    if not scene.joints and not is_alone(scene, bodies, side):
-        held[[side.i, side.j]] = bodies.slow()[[side.i, side.j]]
-    return held
-
-
 def nears(scene, bodies, side, limit, slow):
     """Whether a sample that may get as deep as a limit [m] goes in faster than `slow` [m/s]."""
     if nearing(scene, bodies, side) <= slow:
@@ -495,8 +477,7 @@ def find(scene, bodies, shares=None):
         given = shares.get((side.i, side.j))
         met = hitting if listed(scene, bodies, side, hitting).beta > 0 else lasting
         found.append(listed(scene, bodies, side, met if given is None else met._replace(share=given)))
-    found = halved([points for points in found if len(points.area)], bodies)
-    return together(bodies, [points for points in found if len(points.area)])
+    return together(bodies, halved([points for points in found if len(points.area)]))
 
 
 def rounded(pair, normal):
@@ -514,13 +495,10 @@ def unit_rows(vectors):
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-OF_POINTS = ("arm", "normal", "moment", "depth", "rate", "meets", "area", "drift", "impact", "sunk")
-
-
 def listed(scene, bodies, side, met):
     """The listed points of a side whose geometry is taken when its bodies meet."""
     start = bodies
-    bodies = bodies.falling(held_of(scene, bodies, side)) if met.falls else bodies.held()
+    bodies = bodies.falling() if met.falls else bodies.held()
     if met.falls:
         bodies = bodies.supported(on_bodies(bodies, side.i, side.j, met.support))
     i, j, h, share = side.i, side.j, bodies.h, met.share
@@ -587,7 +565,6 @@ def listed(scene, bodies, side, met):
         drift=drift[kept],
         impact=(stiffness * met.hits * weight)[kept],
         kappa=stiffness * met.hits,
-        nearing=-float(near_load @ approach) / max(near_load.sum(), 1e-300),
         sunk=np.where(other, 0, before)[kept],
         delta=delta,
         deepest=deepest,
@@ -655,15 +632,8 @@ def impact(bodies, side, arm, normal, load, near_load, approach):
     return beta, factor / (bodies.h * mobility * load.sum())
 
 
-def halved(found, bodies):
+def halved(found):
     """Sides of pairs as they take part in one impact, with half of it each if both do."""
-    by_pair = {points[:2]: points for points in found}
-    agreed = {}
-    for pair, points in by_pair.items():
-        other = by_pair.get(pair[::-1])
-        if other is not None and all(bodies.moves[list(pair)]):
-            agreed[pair] = at_one_moment(points, other, bodies)
-    found = [agreed.get(points[:2], points) for points in found]
     hits = {points[:2] for points in found if np.any(points.impact > 0)}
     return [
         points._replace(impact=points.impact / 2, kappa=points.kappa / 2, part=0.5)
@@ -671,28 +641,6 @@ def halved(found, bodies):
         else points
         for points in found
     ]
-
-
-def at_one_moment(side, other, bodies):
-    """A side of a pair that moves, with impulses that take effect when those of the other one do.
-
-    The side that meets first says when, or that they do not wait. The other takes part if it has met by then,
-    too, but for δ, or else in the next step, unless the bodies rest on it: then impulses act from the start.
-    """
-    if not (side.kappa > 0 and other.kappa > 0):
-        return side
-    earlier, later = sorted((side, other), key=lambda points: (points.share, points[:2]))
-    until = max(earlier.delays * earlier.share, 0)
-    delays = until / side.share if until else 0.0
-    if earlier.delays and (later.share - earlier.share) * bodies.h * later.nearing > later.delta:
-        if np.any(later.depth > 0):
-            delays = 0.0
-        elif side is later:
-            none = {name: getattr(side, name)[:0] for name in OF_POINTS}
-            return side._replace(kappa=0.0, delays=0.0, **none)
-        else:
-            return side
-    return side._replace(delays=delays, way=(1 - delays) * max(side.share, 0.0))
 
 
 def together(bodies, found):

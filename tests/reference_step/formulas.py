@@ -21,6 +21,7 @@ def press(
     materials: wp.array(dtype=point_law.Material),
     points: wp.array(dtype=point_law.Point),
     impacts: wp.array(dtype=point_law.Impact),
+    damper: wp.float64,
     rates: wp.array(dtype=wp.float64),
     slips: wp.array(dtype=vec3),
     pressures: wp.array(dtype=wp.float64),
@@ -28,7 +29,7 @@ def press(
 ):
     """Pressure and friction at points that separate and slip."""
     i = wp.tid()
-    law = point_law.point_law(materials[i], points[i], impacts[i])
+    law = point_law.point_law(materials[i], points[i], impacts[i], damper)
     found = point_law.traction(law, rates[i], slips[i])
     pressures[i] = found.pressure
     frictions[i] = found.friction
@@ -77,6 +78,7 @@ def traction(material: dict[str, float], points, rate, slip):
         wp.array(of_material, dtype=point_law.Material, device="cpu"),
         wp.array(rows, dtype=point_law.Point, device="cpu"),
         wp.array(of_impact, dtype=point_law.Impact, device="cpu"),
+        points.law.damper,
         wp.array(rate, dtype=wp.float64, device="cpu"),
         wp.array(slip, dtype=vec3, device="cpu"),
     ]

@@ -25,6 +25,7 @@ class Law(NamedTuple):
         F: Momentum that an impact passes on over that of the common mass, for each speed that is missing.
         slowest_rebound: v_e + g h or √(g δ), whichever is larger [m/s].
         gravity: g for samples that are deep [m/s²].
+        damper: Hardest damper that a sample is in contact that lasts [N s/m].
     """
 
     k: float
@@ -42,6 +43,7 @@ class Law(NamedTuple):
     F: float
     slowest_rebound: float
     gravity: float
+    damper: float
 
 
 PARAMETERS = (
@@ -64,6 +66,7 @@ def laws_of(scene):
         groups.append((scene.others.law, scene.others.pair_params, len(scene.others.pairs)))
     found = []
     sizes = [min(float(scene.bodies[k].extent[4]) for k in pair) for pair in scene.point_pairs]
+    inverse = [0.0 if body.fixed else 1 / float(body.mass * body.mass_scale) for body in scene.bodies]
     for law, params, count in groups:
         columns = [np.broadcast_to(getattr(params, name), count) for name in PARAMETERS]
         for numbers in np.array(columns).T:
@@ -71,7 +74,8 @@ def laws_of(scene):
             rest = float(law.stiction_velocity), float(law.implicitness), law.compliant
             F = np.clip(sizes[len(found)] / (2 * delta), 100.0, 1e4)
             rest = *rest, h, delta, F, max(v_e + g * h, (g * delta) ** 0.5), g if g > 0 else 9.81
-            found.append(Law(k, e, v_e, sigma, mu, phi, p_0, *rest))
+            damper = 1000 / (h * sum(inverse[body] for body in scene.point_pairs[len(found)]))
+            found.append(Law(k, e, v_e, sigma, mu, phi, p_0, *rest, damper))
     return found
 
 
@@ -140,8 +144,9 @@ def pressure(law, points, rate, v_s):
         slope = -law.k * (left > 0) * np.where(implicit, law.theta * law.h, D_slope)
     else:
         left = np.maximum(points.depth - law.theta * law.h * rate, 0)
-        p = law.k * left * (1 - lost)
-        slope = -law.k * (left > 0) * (law.theta * law.h * (1 - lost) + left * lost_slope)
+        k = np.minimum(law.k, law.damper * v_e / np.maximum(points.area * deep, 1e-300))
+        p = k * left * (1 - lost)
+        slope = -k * (left > 0) * (law.theta * law.h * (1 - lost) + left * lost_slope)
 
     missing = np.maximum(goals(law, points) - rate, 0)
     # Samples that are less deep than the impact get no deeper, or, where bodies wait until they meet, by so

@@ -7,7 +7,7 @@ from reference_step.law import Law, pressure, smooth_step, traction, wrench
 
 HARD = Law(
     k=2e6, e=0.4, v_e=0.05, sigma=0.2, mu=0.5, phi=0.3, p_0=2e3, v_s=1e-7, theta=1.0, compliant=False, h=0.01,
-    delta=1e-3, F=100.0, slowest_rebound=0.15, gravity=9.81,
+    delta=1e-3, F=100.0, slowest_rebound=0.15, gravity=9.81, damper=300.0,
 )  # fmt: skip
 LAWS = {
     "default": HARD,
@@ -49,7 +49,6 @@ def random_points(law, impact):
         drift=drift,
         impact=impact * np.where(x < 1, np.maximum(x, 0) ** 2, 2 * x - 1) * counts,
         kappa=impact,
-        nearing=0.0,
         sunk=law.delta * x,
         delta=law.delta,
         deepest=5 * law.delta,

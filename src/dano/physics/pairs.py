@@ -214,16 +214,6 @@ def moved_in_impact(body: BodyState, velocity: vec6) -> vec6:
 
 
 @wp.func
-def hardly_moves(body: BodyState) -> bool:
-    """Whether a body moves by less than it falls in half a step: others hold such a one."""
-    if body.inverse_mass == ZERO:
-        return False
-    radius_squared = real(3.0) * body.inverse_mass / wp.trace(body.inverse_inertia)
-    squared = wp.length_sq(body.velocity) + radius_squared * wp.length_sq(body.spin)
-    return squared < real(0.25) * wp.length_sq(body.gain)
-
-
-@wp.func
 def way_of(a: BodyState, b: BodyState, middle: vec3, radius: real, h: real) -> real:
     """Most that a point of a ball moves relative to another body within the step [m].
 

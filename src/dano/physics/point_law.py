@@ -172,13 +172,17 @@ class Linear:
 
 
 @wp.func
-def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
+def point_law(material: Material, point: Point, impact: Impact, damper: real) -> PointLaw:
     """The constants of a point.
+
+    What is deep is pushed out at v_e: it is a damper of k A d/v_e. Of stiff bodies that are far deeper than
+    they rest it would be so hard that a solver hardly finds the root, so k is less there.
 
     Args:
         material: Of the contact.
         point: The point.
         impact: Of the pair.
+        damper: Hardest damper that a sample may be, where impacts end within the step [N s/m].
     """
     law = PointLaw()
     # Impacts that end within the step have had their restitution: what presses on gives nothing back.
@@ -188,10 +192,16 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
     # What rests on goes on to press where another part of the patch has an impact.
     rests = (ONE - is_impact(point.approach, material.bounce)) * may_rest(impact, point.sunk)
     hits = impact.share * (ONE - rests)
-    law.stiffness = (ONE - hits) * material.stiffness
     law.depth = point.depth
     law.ahead = material.ahead
     sunk = wp.max(point.depth, ZERO)
+    law.restitution_velocity = wp.sqrt(
+        wp.max(material.restitution_velocity * material.restitution_velocity, material.uplift * sunk)
+    )
+    stiffness = material.stiffness
+    if material.instant > ZERO and stiffness * point.area * sunk > damper * law.restitution_velocity:
+        stiffness = damper * law.restitution_velocity / (point.area * sunk)
+    law.stiffness = (ONE - hits) * stiffness
     law.damped = loss - kept
     law.lost = kept
     if material.instant == ZERO:
@@ -210,9 +220,6 @@ def point_law(material: Material, point: Point, impact: Impact) -> PointLaw:
         gained = gains.falls + (ONE - rebounds) * gains.held
         across = gained - wp.dot(point.normal, gained) * point.normal
         law.extra_slip -= impact.delays * across
-    law.restitution_velocity = wp.sqrt(
-        wp.max(material.restitution_velocity * material.restitution_velocity, material.uplift * sunk)
-    )
     law.friction = material.friction
     law.fading = material.friction_fading
     law.friction_pressure = material.friction_pressure

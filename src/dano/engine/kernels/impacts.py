@@ -45,68 +45,6 @@ def is_quiet(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundP
 
 
 @wp.func
-def leave_to_next(room: wp.ref[Room], world: int, k: int, h: real):
-    """Leave a side of a pair to the next step."""
-    found = room.found[world, k]
-    found.end = found.first
-    found.impact = no_impact(found.impact.depth, found.impact.factor, found.impact.deepest, h)
-    room.found[world, k] = found
-
-
-@wp.func
-def agree_on_moment(room: wp.ref[Room], world: int, earlier: int, later: int, h: real) -> bool:
-    """Have both sides of a pair that have an impact meet at one moment: else its momentum would change.
-
-    The side that meets first says when, or that impulses do not wait. The other one takes part if it has met
-    by then, too, but for δ. Else it is left to the next step, unless the bodies rest on it: then impulses act
-    from the start of the step.
-
-    Args:
-        room: Where the sides stand.
-        world: The world.
-        earlier: The side that meets first.
-        later: The other one.
-        h: Timestep [s].
-
-    Returns:
-        Whether the other one takes part.
-    """
-    ahead = room.found[world, earlier]
-    behind = room.found[world, later]
-    if ahead.impact.delays == ZERO:
-        room.found[world, later].impact = delayed(behind.impact, ZERO, behind.share, h)
-        return True
-    way = (behind.share - ahead.share) * h * -behind.patch.near_rate / behind.patch.near_load
-    until = ahead.impact.delays * ahead.share
-    rests = way > behind.impact.depth and touches(room, world, behind)
-    if way > behind.impact.depth and not rests:
-        leave_to_next(room, world, later, h)
-        return False
-    if rests or until <= ZERO:
-        room.found[world, earlier].impact = delayed(ahead.impact, ZERO, ahead.share, h)
-        room.found[world, later].impact = delayed(behind.impact, ZERO, behind.share, h)
-    else:
-        room.found[world, later].impact = delayed(behind.impact, until / behind.share, behind.share, h)
-    return True
-
-
-@wp.func
-def both_take_part(
-    scene: wp.ref[Scene], room: wp.ref[Room], world: int, one: int, other: int, first: int, second: int
-) -> bool:
-    """Whether both sides of a pair take part in one impact; they agree on its moment if both bodies move."""
-    mine = room.found[world, one]
-    theirs = room.found[world, other]
-    if mine.impact.stiffness == ZERO or theirs.impact.stiffness == ZERO:
-        return False
-    if wp.static(not TREES):
-        if scene.body_index[first].row >= 0 and scene.body_index[second].row >= 0:
-            earlier = wp.where(mine.share <= theirs.share, one, other)
-            return agree_on_moment(room, world, earlier, one + other - earlier, scene.timestep[world, 0])
-    return True
-
-
-@wp.func
 def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
     """Have both sides of a pair take part in one impact: samples of the first body, and of the second."""
     for f in range(1, n_found):
@@ -115,7 +53,8 @@ def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
         mine = scene.pair_index[room.found[world, one].pair]
         theirs = scene.pair_index[room.found[world, other].pair]
         if mine.first == theirs.second and mine.second == theirs.first:
-            if both_take_part(scene, room, world, one, other, mine.first, mine.second):
+            hits = room.found[world, one].impact.stiffness > ZERO
+            if hits and room.found[world, other].impact.stiffness > ZERO:
                 room.found[world, one].impact.part = HALF
                 room.found[world, other].impact.part = HALF
 

@@ -166,8 +166,8 @@ def left_out(found: FoundPair, factor: real) -> real:
 @wp.func
 def as_they_meet(a: BodyState, b: BodyState, found: FoundPair, h: real) -> tuple[BodyState, BodyState]:
     """Bodies of a pair with what their velocities gain until they meet: by gravity, and what they rest on."""
-    first = falling(a, found.first_falls)
-    second = falling(b, found.second_falls)
+    first = falling(a, found.falls)
+    second = falling(b, found.falls)
     if wp.static(not TREES):
         if wp.length_sq(found.support) > ZERO:
             first = supported(first, found.support, h)

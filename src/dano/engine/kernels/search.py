@@ -30,6 +30,7 @@ from dano.engine.kernels.tables import (
     BLOCK,
     FoundPair,
     FoundPoint,
+    numbers_of,
     Room,
     RUN,
     Scene,
@@ -53,7 +54,6 @@ from dano.physics.impacts import (
 from dano.physics.pairs import (
     BodyState,
     falling,
-    hardly_moves,
     PairPose,
     speed_within,
 )
@@ -337,8 +337,6 @@ class Coming:
         lasts: Whether its contact lasts: it has no impact.
         alone: Whether one of the bodies is fixed.
         waits: Whether impulses may wait until the bodies meet.
-        first_falls: 1 where the first body falls freely meanwhile; others hold what hardly moves.
-        second_falls: The same of the second one.
         rest: What it rests on when the step begins.
         support: Impulse of that, see `FoundPair.support`.
     """
@@ -347,8 +345,6 @@ class Coming:
     lasts: bool
     alone: bool
     waits: bool
-    first_falls: int
-    second_falls: int
     rest: Rest
     support: vec6
 
@@ -376,26 +372,16 @@ def coming_of(
     slow = pair.h * material.bounce
     limits = limits_of(pair.numbers.impact_depth, slow, slow, ZERO)
     coming = Coming()
-    coming.first_falls = 1
-    coming.second_falls = 1
     if wp.static(not TREES):
         coming.alone = scene.body_index[pair.first].row < 0 or scene.body_index[pair.second].row < 0
-        limits.since = -ONE
-        if not coming.alone:
-            coming.first_falls = wp.where(hardly_moves(a), 0, 1)
-            coming.second_falls = wp.where(hardly_moves(b), 0, 1)
+        if coming.alone:
+            limits.since = -ONE
+    coming.waits = coming.alone
     coming.lasts = material.instant == ZERO
     if not coming.lasts:
-        seen = falling(a, coming.first_falls)
-        other = falling(b, coming.second_falls)
-        coming.met = meeting(scene, room, world, lane, pair, seen, other, limits)
-        if not coming.alone and coming.met.share <= -ONE:
-            # Two that move and have been in each other for longer meet as the step begins, and do not wait.
-            limits.since = ZERO
-            coming.met = meeting(scene, room, world, lane, pair, seen, other, limits)
+        coming.met = meeting(scene, room, world, lane, pair, falling(a, 1), falling(b, 1), limits)
         # What moves so slowly has no impact.
         coming.lasts = coming.met.slow
-    coming.waits = limits.since < ZERO
     if coming.lasts:
         coming.met = meeting(
             scene, room, world, lane, pair, falling(a, 0), falling(b, 0), limits_of_lasting(pair)
@@ -409,8 +395,7 @@ def coming_of(
                 other = falling(b, 1)
                 coming.support = support_of(seen, other, coming.rest, material.friction, pair.h, pair.turning)
                 found = FoundPair()
-                found.first_falls = 1
-                found.second_falls = 1
+                found.falls = 1
                 found.support = coming.support
                 seen, other = as_they_meet(a, b, found, pair.h)
                 limits.sink = depth_beside(coming.rest, pair.numbers.impact_depth)
@@ -476,8 +461,7 @@ def find_pair(
     while again:
         again = False
         found.hits = wp.where(not lasts and met.share < ONE, 1, 0)
-        found.first_falls = wp.where(not lasts and met.nears, coming.first_falls, 0)
-        found.second_falls = wp.where(not lasts and met.nears, coming.second_falls, 0)
+        found.falls = wp.where(not lasts and met.nears, 1, 0)
         if lasts or not met.nears:
             found.support = vec6()
         found.critical = met.critical
@@ -501,7 +485,7 @@ def find_pair(
             limits = limits_of_lasting(pair)
             if before < ONE or met.least < -limits.sink:
                 met = meeting(scene, room, world, lane, pair, falling(a, 0), falling(b, 0), limits)
-            again = met.share != before or found.first_falls + found.second_falls > 0
+            again = met.share != before or found.falls > 0
     seen, other = as_they_meet(a, b, found, pair.h)
     found.toward = facing(scene, world, pair, seen, other, found.share)
     found.end = wp.min(after, end)
@@ -579,8 +563,9 @@ def fix_laws(
             material.restitution = rebound * material.restitution
         if not differentiates:
             material.gradual = ZERO
+        damper = numbers_of(scene, world, found.pair).damper
         for k in range(found.first, found.end):
             point = room.points[world, k]
-            law = point_law(material, point, found.impact)
+            law = point_law(material, point, found.impact, damper)
             room.laws[world, k] = law
             room.gates[world, k] = gate_of(point, law)

@@ -71,6 +71,7 @@ class SamplePair:
     factor: real  # F of its damper, see `dano.physics.impacts.Impact` [1]
     deepest: real  # Depth that no part gets beyond within a step with an impact of another part [m]
     margin: real  # Distance within which samples count as near [m]
+    damper: real  # Hardest damper that a sample is, see `dano.physics.point_law.point_law` [N s/m]
 
 
 @wp.struct
@@ -207,9 +208,7 @@ class FoundPair:
     critical: wp.int32  # Sample that says when the bodies meet, −1 where they do not within the step
     share: real  # τ
     hits: wp.int32  # 1 where τ is when the bodies are as deep as in an impact
-    # 1 where the first or the second body falls freely until they meet: then gravity takes part in its way.
-    first_falls: wp.int32
-    second_falls: wp.int32
+    falls: wp.int32  # 1 where both fall freely until they meet: then gravity takes part in their way
     waits: wp.int32  # 1 where impulses of an impact take effect when the bodies meet
     impact: Impact  # Of the pair
     patch: Patch  # Its samples that have sunk in

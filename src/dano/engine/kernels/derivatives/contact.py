@@ -147,7 +147,7 @@ def sample_work(
     h = at.timestep
     point = point_contact(at.pose, sample, d, at.turning, presses_back, at.numbers.share, at.share * h)
     if what == PRESSES:
-        law = point_law(at.material, point, at.impact)
+        law = point_law(at.material, point, at.impact, at.numbers.damper)
         apart = at.pose.com_difference
         twist = relative_twist(twists.first, twists.second, apart)
         virtual = relative_twist(twists.first_virtual, twists.second_virtual, apart)
@@ -501,8 +501,8 @@ def pull_support(
     The others are those by what supports them, by `left_out` and by the depth at which they meet.
     """
     near = near_pair(scene, world, found.pair)
-    a = falling(room.bodies[world, near.first], found.first_falls)
-    b = falling(room.bodies[world, near.second], found.second_falls)
+    a = falling(room.bodies[world, near.first], found.falls)
+    b = falling(room.bodies[world, near.second], found.falls)
     at = met_pair(scene, world, near, a, b, ZERO, facing(scene, world, near, a, b, ZERO))
     samples = touching_of(scene, world, found, near, at)
     samples.fall = fall_of(a, b, near.numbers.impact_depth, near.h)
@@ -638,6 +638,6 @@ def pull_pair(
         if wp.length_sq(found.support) > ZERO:
             bar = pull_support(scene, room, world, lane, found, support_bar, by.rests, depth_bar, bar)
     if lane == 0:
-        bar.first = falling_bar(bar.first, found.first_falls)
-        bar.second = falling_bar(bar.second, found.second_falls)
+        bar.first = falling_bar(bar.first, found.falls)
+        bar.second = falling_bar(bar.second, found.falls)
     return bar, by_twists
