@@ -3,11 +3,13 @@
 import functools
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from engine.scenes import last, point_cloud_box
+from reference_step.scenes import lump
 
 import dano
 
@@ -181,3 +183,53 @@ def test_two_neural_objects_meet():
     coming = {"position": (0.3, 0.02, 0.01), "velocity": (-1, 0, 0), "orientation": (1, 0.2, 0.1, 0.3)}
     # They touch in an impact only, which ends within its step whatever the stiffness.
     check_rollout(Case(scene, scene.initial_state(a=coming)), 25, irrelevant=("stiffness",))
+
+
+@pytest.mark.parametrize(
+    ("shape", "height"),
+    [
+        (dano.Sphere(0.03), 0.0655),
+        # Rounder than the search for its first touch needs to come to an end.
+        (dano.Ellipsoid((0.03, 0.028, 0.026)), 0.0612),
+        (dano.Cylinder(0.03, 0.02), 0.0563),
+    ],
+    ids=["ball", "ellipsoid", "cylinder"],
+)
+def test_grids_that_round_bodies_hit(shape, height):
+    """By a sampled distance's coefficients, and by the start: which way samples face depends on both."""
+    scene = dano.Scene.create(
+        [dano.Body("ball", shape, mass=0.3), dano.Body("lump", lump())],
+        [dano.Contact("ball", "lump", dano.ContactParams(restitution=0.3, sliding_friction=0.3))],
+        timestep=2e-3,
+        gravity=(0.0, 0.0, 0.0),
+    )
+    start = scene.initial_state(
+        ball=dict(position=(0.005, 0.01, height), velocity=(0.02, 0.01, -0.2), omega=(0.3, 0.2, 0.1)),
+        lump=dict(omega=(0.05, -0.1, 0.2)),
+    )
+    coefficients = scene.bodies[1].solid.coefficients
+    rng = np.random.default_rng(3)
+    bumps, weights = 1e-3 * rng.normal(size=coefficients.shape), rng.normal(size=(2, 3))
+
+    def final(theta):
+        changed = coefficients + theta[0] * bumps
+        bumpy = eqx.tree_at(lambda s: s.bodies[1].solid.coefficients, scene, changed)
+        moved = start.position.at[0].add(theta[1] * jnp.array([0.001, 0.002, 0.001]))
+        pushed = start.velocity.at[0].add(theta[1] * jnp.array([0.3, 0.2, -0.5]))
+        run = dano.simulate(bumpy, dano.State(moved, start.orientation, pushed, start.omega), 6)
+        return jnp.sum(weights * last(run.states).velocity), run.converged.all()
+
+    def derivatives(theta):
+        only = lambda theta: final(theta)[0]  # noqa: E731
+        return jax.grad(only)(theta), jax.jacfwd(only)(theta)
+
+    zero = jnp.zeros(2)
+    value = jax.jit(final, compiler_options=QUICKLY)
+    assert bool(value(zero)[1])
+    by_reverse, by_forward = jax.jit(derivatives, compiler_options=QUICKLY)(zero)
+    np.testing.assert_allclose(by_reverse, by_forward, rtol=1e-5)
+    for step in (1e-5, 1e-6):
+        ends = [[value(sign * step * e)[0] for sign in (1, -1)] for e in np.eye(2)]
+        differences = [(after - before) / (2 * step) for after, before in ends]
+        np.testing.assert_allclose(by_reverse, differences, rtol=1e-4)
+    assert abs(by_reverse[0]) > 1e-4, "the solid must matter"

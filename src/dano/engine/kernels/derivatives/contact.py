@@ -27,14 +27,12 @@ from dano.physics.pairs import (
     BALL,
     BodyState,
     centres_apart,
-    closer,
     falling,
     falling_bar,
     first_touch,
     FIXED,
     pair_pose,
     PairPose,
-    seen_from,
     shrunk,
 )
 from dano.physics.point_law import (
@@ -47,6 +45,7 @@ from dano.physics.point_law import (
     traction,
 )
 from dano.physics.real import mat33, ONE, real, vec3, vec6, ZERO
+from dano.physics.rotations import direction
 from dano.physics.samples import facing_area, point_contact, position_in_solid, Sample, solid_normal
 from dano.physics.solids.distances import leaf_distance, nearest_leaf, Solid
 from dano.physics.solids.grids import distance_change
@@ -186,17 +185,16 @@ def critical_work(at: MetPair, sample: vec3, gradient: vec3) -> real:
 
 
 @wp.func
-def facing_work(
-    solids: Solids, world: int, solid: Solid, at: MetPair, point: vec3, by_toward: vec3, bar: vec3
-) -> real:
-    """⟨bars, direction that samples face, and where one step of the search for it leads from a point⟩."""
+def facing_work(at: MetPair, start: vec3, d: Distance, by_x: vec3, by_toward: vec3, by_next: vec3) -> real:
+    """⟨bars, where a search asks a solid, which way samples face, where the next step of the search starts⟩.
+
+    A step starts where the solid is asked, in axes of the body; `d` is its distance there.
+    """
     pose = pose_of(at, _FIXED)
-    if at.turning == _AXIS:
-        return wp.dot(by_toward, seen_from(solids, world, solid, pose.points, pose.origin).gradient)
-    found = closer(solids, world, solid, pose.points, pose.origin, at.scale, point)
-    least = wp.min(at.scale[0], wp.min(at.scale[1], at.scale[2]))
-    touched = shrunk(at.scale, least, point) + wp.max(found.value, ZERO) * found.gradient
-    return wp.dot(by_toward, found.gradient) + wp.dot(bar, touched)
+    toward = direction(-(wp.transpose(pose.points) * d.gradient))
+    following = shrunk(at.scale, wp.min(at.scale), start + wp.max(d.value, ZERO) * toward)
+    work = wp.dot(by_x, position_in_solid(pose, start)) + wp.dot(by_toward, toward)
+    return work + wp.dot(by_next, following)
 
 
 @wp.func
@@ -253,7 +251,7 @@ add_to_touching, total_touching = adding_of(Touching), total_of(Touching)
 add_to_twists, total_twists = adding_of(Virtual), total_of(Virtual)
 add_to_leaf, add_to_material, add_to_pair = map(addition_of, (Leaf, Material, SamplePair))
 add_material = adding_of(Material)
-scaled_leaf, distance_product = scaled_of(Leaf), product_of(Distance)
+distance_product, scaled_distance, add_to_distance = (f(Distance) for f in (product_of, scaled_of, adding_of))
 
 
 @wp.func
@@ -268,17 +266,14 @@ def leaf_at(scene: wp.ref[Scene], world: int, body: int, x: vec3) -> Solid:
 @wp.func
 def add_part(room: wp.ref[Room], world: int, lane: int, direction: int, change: real):
     """Add to a lane's part of what changes in a direction make of a number."""
-    room.lane_sums[world, direction * _LANES + lane] = (
-        room.lane_sums[world, direction * _LANES + lane] + change
-    )
+    at = direction * _LANES + lane
+    room.lane_sums[world, at] = room.lane_sums[world, at] + change
 
 
 @wp.func
 def n_moving(scene: wp.ref[Scene], room: wp.ref[Room]) -> int:
     """In how many directions coefficients of sampled solids change."""
-    if scene.solids.changes.shape[1] == 0:
-        return 0
-    return room.lane_sums.shape[1] // _LANES
+    return wp.where(scene.solids.changes.shape[1] == 0, 0, room.lane_sums.shape[1] // _LANES)
 
 
 @wp.func
@@ -359,53 +354,53 @@ def pull_samples(
     return total_touching(bar), twists_bar
 
 
+@wp.func_native("solids.coefficients.grad = nullptr;")
+def drop_gradients(solids: wp.ref[Solids]):
+    """Have Warp add no derivatives by the coefficients of a copy of solids."""
+
+
 @wp.func
-def facing_point_bar(
-    scene: wp.ref[Scene], world: int, solid: Solid, at: MetPair, point: vec3, toward_bar: vec3
-) -> vec3:
-    """Derivative by where the search for the first touch ended, x = G(x): (1 − ∂G/∂x)⁻ᵀ x̄."""
-    zero = vec3()
-    _a, _b, _c, _d, point_bar, _e, _f = wp.grad(facing_work)(
-        scene.solids, world, solid, at, point, toward_bar, zero
-    )
-    rows = mat33()
-    k = int(0)
-    while k < 3:
-        unit = vec3()
-        unit[k] = ONE
-        _g, _h, _i, _j, by_point, _k, _l = wp.grad(facing_work)(
-            scene.solids, world, solid, at, point, zero, unit
-        )
-        rows[k] = unit - by_point
-        k += 1
-    return wp.inverse(wp.transpose(rows)) * point_bar
+def pull_search(
+    solids: Solids, world: int, solid: Solid, at: MetPair, start: vec3, by_toward: vec3, by_next: vec3
+) -> tuple[MetPair, vec3, Distance]:
+    """Derivatives by a pair, by where a step of the search starts, and by the distance there."""
+    # Those by coefficients follow from the sum of all parts: Warp would add them at each call.
+    drop_gradients(solids)
+    x = position_in_solid(pose_of(at, _FIXED), start)
+    d = leaf_distance(solids, world, solid.kind, solid.leaf, x)
+    _a, _b, by_d, _c, _d, _e = wp.grad(facing_work)(at, start, d, vec3(), by_toward, by_next)
+    _f, _g, _h, _i, by_x, _j = wp.grad(distance_work)(solids, world, solid.kind, solid.leaf, x, by_d)
+    by, by_start, _k, _l, _m, _n = wp.grad(facing_work)(at, start, d, by_x, by_toward, by_next)
+    return by, by_start, by_d
 
 
+@after_adjoints
 @wp.func
 def pull_facing(
-    scene: wp.ref[Scene], world: int, second: int, at: MetPair, bar: MetPair
-) -> tuple[MetPair, int, Leaf]:
-    """Derivatives by a pair, with those through the direction that samples face; by a leaf, and which it is.
+    solids: Solids, world: int, solid: Solid, at: MetPair, start: vec3, bar: MetPair
+) -> tuple[MetPair, Distance]:
+    """Derivatives by a pair, with those through the direction that samples face; by the distance it is of.
 
-    A ball or an ellipsoid faces where the search for its first touch ended: a fixed point of the search,
-    differentiated by the implicit function theorem.
+    A ball or an ellipsoid faces where the search for its first touch ended: a fixed point x = G(x) of the
+    search, differentiated by the implicit function theorem, (1 − ∂G/∂x)⁻ᵀ x̄.
     """
     if at.turning == _FIXED:
-        return bar, scene.body_index[second].first_leaf, Leaf()
-    pose = pose_of(at, _FIXED)
-    point = vec3()
-    solid = leaf_at(scene, world, second, pose.origin)
-    point_bar = vec3()
+        return bar, Distance()
+    by_next = vec3()
     if at.turning == _BALL:
-        whole = solid_of_body(scene, world, second)
-        point = first_touch(scene.solids, world, whole, pose.points, pose.origin, at.scale)
-        solid = leaf_at(scene, world, second, pose.origin + pose.points * point)
-        point_bar = facing_point_bar(scene, world, solid, at, point, bar.toward)
-    _a, _b, by_solid, faces, _c, _d, _e = wp.grad(facing_work)(
-        scene.solids, world, solid, at, point, bar.toward, point_bar
-    )
+        _a, by_end, _b = pull_search(solids, world, solid, at, start, bar.toward, by_next)
+        rows = mat33()
+        k = int(0)
+        while k < 3:
+            unit = vec3()
+            unit[k] = ONE
+            _c, by_start, _d = pull_search(solids, world, solid, at, start, vec3(), unit)
+            rows[k] = unit - by_start
+            k += 1
+        by_next = wp.inverse(wp.transpose(rows)) * by_end
+    faces, _e, by_distance = pull_search(solids, world, solid, at, start, bar.toward, by_next)
     add_to_met(faces, bar)
-    return faces, solid.first, by_solid.leaf
+    return faces, by_distance
 
 
 @wp.func
@@ -421,14 +416,20 @@ def pull_pose(
 ) -> tuple[MetPair, real]:
     """Derivatives by a pair's bodies, and by the depth at which they meet, from those by its pose, τ and h.
 
-    One lane alone comes here: Warp itself adds those by coefficients. `critical` is the sample that says when
-    they meet, −1 for none.
+    One lane alone comes here. `critical` is the sample that says when they meet, −1 for none.
     """
     of_pose, _a, _b = wp.grad(pose_work)(at, at.turning, by.pose)
     of_pose.share += by.share
     of_pose.timestep += by.timestep
-    bar, leaf, by_leaf = pull_facing(scene, world, second, at, of_pose)
-    add_to_leaf(room.bars.leaves, world, leaf, by_leaf)
+    pose = pose_of(at, _FIXED)
+    end = vec3()
+    if at.turning == _BALL:
+        whole = solid_of_body(scene, world, second)
+        end = first_touch(scene.solids, world, whole, pose.points, pose.origin, at.scale)
+    start = shrunk(at.scale, wp.min(at.scale), end)
+    place = position_in_solid(pose, start)
+    seen = leaf_at(scene, world, second, place)
+    bar, by_seen = pull_facing(scene.solids, world, seen, at, start, of_pose)
     depth_bar = real(0.0)
     if critical >= 0:
         # τ is the root of distance + depth = 0 at the critical sample.
@@ -437,16 +438,18 @@ def pull_pose(
         solid = leaf_at(scene, world, second, x)
         d = leaf_distance(scene.solids, world, solid.kind, solid.leaf, x)
         of_body, of_sample, _c = wp.grad(critical_work)(at, point, d.gradient)
-        of, of_leaf, by_of_leaf = pull_facing(scene, world, second, at, of_body)
+        of, of_seen = pull_facing(scene.solids, world, seen, at, start, of_body)
         if of.share < ZERO:
             depth_bar = -bar.share / of.share
             add_to_met(bar, scaled_met(depth_bar, of))
-            add_to_leaf(room.bars.leaves, world, of_leaf, scaled_leaf(depth_bar, by_of_leaf))
+            add_to_distance(by_seen, scaled_distance(depth_bar, of_seen))
             of_distance = Distance()
             of_distance.value = depth_bar
             _d = pull_distance(scene, room, world, lane, solid, x, of_distance)
             if room.bars.samples.shape[1] > 0:
                 room.bars.samples[world, critical].point += depth_bar * of_sample
+    if at.turning != _FIXED:
+        _e = pull_distance(scene, room, world, lane, seen, place, by_seen)
     return bar, depth_bar
 
 
