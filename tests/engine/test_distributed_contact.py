@@ -296,6 +296,27 @@ def test_bodies_set_deep_into_each_other_separate_slowly(shape, offset):
     np.testing.assert_allclose(jnp.sum(run.states.velocity[-1], axis=0), 0, atol=1e-9)
 
 
+def test_a_heavy_body_rests_on_a_light_one():
+    """What makes deep contact softer leaves what rests alone: 30 kg on 50 g sink in by W/(k A)."""
+    sizes, masses = ((0.05, 0.05, 0.01), (0.04, 0.04, 0.1)), (0.05, 30.0)
+    light, heavy = (
+        dano.Body(*x[:2], mass=x[2]) for x in zip("ab", map(dano.Box, sizes), masses, strict=True)
+    )
+    stiffness = 1e9
+    params = dano.ContactParams(stiffness=stiffness)
+    contacts = [dano.Contact("b", "a", params), dano.Contact("a", "floor", params)]
+    bodies = [light, heavy, dano.Body("floor", dano.HalfSpace(), fixed=True)]
+    scene = dano.Scene.create(bodies, contacts, timestep=0.005)
+    run = dano.simulate(
+        scene, scene.initial_state(a={"position": (0, 0, 0.01)}, b={"position": (0, 0, 0.12)}), 400
+    )
+    assert bool(jnp.all(run.converged))
+    weight = 9.81 * sum(masses)
+    sinks = 0.01 - run.states.position[-1, 0, 2]
+    np.testing.assert_allclose(sinks, weight / (stiffness * 0.1**2), rtol=0.02)
+    np.testing.assert_allclose(run.states.velocity[-1], 0, atol=1e-6)
+
+
 def test_boxes_set_anyhow_into_each_other_never_fly_apart():
     """A step is not solved because velocities have become so large that rounding exceeds what is missing."""
     bodies = [dano.Body(name, dano.Box((0.1, 0.1, 0.1)), mass=1.0) for name in "ab"]

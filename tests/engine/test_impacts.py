@@ -100,27 +100,6 @@ def above(scene, height, speed=1.5):
 
 
 @pytest.mark.parametrize("on_floor", [False, True], ids=["floats", "lies"])
-def test_where_in_a_step_two_bodies_meet_does_not_matter(on_floor):
-    """The later they meet, the longer they go on as before: where they end lies on a line."""
-    scene = two_boxes(0.0 if not on_floor else 9.81, on_floor=on_floor)
-    h, speed = float(scene.timestep), 1.5
-    heights = 0.15 + np.linspace(0, speed * h, 17)
-
-    def end(height):
-        return dano.simulate(scene, above(scene, height), n_steps=26).states.position[-1, 0]
-
-    ends = np.asarray(jax.vmap(end)(jnp.asarray(heights)))
-    before = np.asarray(jax.vmap(lambda z: above(scene, z).velocity[0])(jnp.asarray(heights)))
-    run = dano.simulate(scene, above(scene, heights[0]), n_steps=26)
-    change = np.linalg.norm(np.asarray(run.states.velocity[-1, 0]) - before[0])
-    assert change > 0.8
-    line = np.polynomial.Polynomial.fit
-    off = [np.abs(line(heights, x, 1)(heights) - x).max() for x in ends.T]
-    # If impulses acted from the start of a step, it would be about a half of h times the change.
-    assert max(off) < 0.05 * h * change
-
-
-@pytest.mark.parametrize("on_floor", [False, True], ids=["floats", "lies"])
 def test_derivatives_after_two_bodies_meet(on_floor):
     """By friction, speed, height and the other's mass; reverse and forward mode against differences."""
     scene = two_boxes(9.81, on_floor=on_floor)
