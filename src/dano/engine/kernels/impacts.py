@@ -10,7 +10,7 @@ from dano.engine.kernels.lanes import total, wait
 from dano.engine.kernels.near import as_they_meet
 from dano.engine.kernels.tables import FoundPair, Room, Scene, StateRow
 from dano.physics.features import LANES, TREES
-from dano.physics.impacts import delayed, no_impact
+from dano.physics.impacts import delayed
 from dano.physics.momentum import end_of_impact, turned_inertia
 from dano.physics.pairs import BodyState, centres_apart, moved_in_impact, rotation_met
 from dano.physics.real import HALF, mat33, ONE, real, vec3, vec6, ZERO
