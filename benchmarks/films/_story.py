@@ -48,15 +48,9 @@ def story_rows(folder: Path) -> list[Row]:
     seconds = [run.seconds for run in runs if run.seconds is not None]
     return [
         *_against_truth(folder / "first", runs[0].answer),
-        _cpu_row(seconds),
+        *([Row(STORY, "CPU", max(seconds), "s", 600.0)] if seconds else []),
         *_apart(folder, [run.answer for run in runs]),
     ]
-
-
-def _cpu_row(seconds: list[float]) -> Row:
-    if not seconds:
-        return Row(STORY, "CPU", None, "s", note="stages of an earlier run were taken up")
-    return Row(STORY, "CPU", max(seconds), "s", 600.0)
 
 
 def _draw(given: Path) -> None:
