@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from dano.vision.trajectory import crossings, Poses, Scenery, smoothed, Solid, solid_of
@@ -298,45 +297,3 @@ def test_a_flight_tells_distances(box, rate):
     for slow in (1e3, 4.0):
         found = [smoothed(slow * times, given, Scenery(box, NOWHERE, table, eye)) for table in (0.0, None)]
         np.testing.assert_array_equal(found[0].poses.position, found[1].poses.position)
-
-
-def spinning(moments, begun, times) -> Rotation:
-    """A free spin by Euler's equations, integrated by SciPy; `begun` is its first angular velocity [F]."""
-
-    def change(_, state):
-        spin, (x, y, z, w) = state[:3], state[3:]
-        rates = np.array([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]])
-        return [*(-np.cross(spin, moments * spin) / moments), *(0.5 * rates @ spin)]
-
-    state = [*begun, 0.0, 0.0, 0.0, 1.0]
-    found = solve_ivp(change, (0, times[-1]), state, t_eval=times, rtol=1e-9, atol=1e-12)
-    return Rotation.from_quat(found.y[3:].T)
-
-
-def test_what_flies_spins_without_torque():
-    """The first frames hardly say how they are turned; those after them tell the spin."""
-    moments = (SIDES**2).sum() - SIDES**2
-    grid = np.stack(np.meshgrid(*[[0, 0.5, 1]] * 3), axis=-1).reshape(-1, 3) * SIDES
-    times = np.arange(12) / 60
-    com = (
-        np.array([0.5, 0.2, 0.3]) + np.outer(times, [0.9, 0.2, 1.5]) - np.outer(times**2, [0, 0, 0.5 * 9.81])
-    )
-    orientation = spinning(moments, [6.0, 9.0, 3.0], times)
-    # Independent of the integration: angular momentum and energy stay.
-    between = (orientation[:-1].inv() * orientation[1:]).as_rotvec() * 60
-    middle = orientation[:-1] * Rotation.from_rotvec(0.5 * between / 60)
-    momentum = middle.apply(moments * between)
-    np.testing.assert_allclose(momentum, momentum[:1].repeat(11, axis=0), atol=0.02 * np.abs(momentum).max())
-    position = com - orientation.apply(0.5 * SIDES)
-    spread = np.tile(np.diag(SURE), (12, 1, 1))
-    spread[:3, 3:, 3:] *= 50
-    given = seen(position, orientation, spread, 2)
-    assert np.linalg.norm(off(given, position, orientation)[:3, 3:], axis=1).max() > 0.2
-    still, errors = np.zeros(11, bool), []
-    for inertia in (np.diag(moments) / 12, np.diag(moments * [1.05, 1.0, 0.95]) / 12, None):
-        solid = solid_of(grid, 0.5 * SIDES, inertia)
-        found = smoothed(times, given, Scenery(solid, still, 0.0, np.array([0.6, -0.9, 0.8])))
-        errors.append(np.linalg.norm(off(found.poses, position, orientation)[:, 3:], axis=1))
-    known, uneven, unknown = errors
-    assert known.max() < np.radians(1.0) and uneven.max() < np.radians(1.5)
-    assert unknown[:3].max() > 3 * known[:3].max()

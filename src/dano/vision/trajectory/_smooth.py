@@ -3,10 +3,9 @@
 Least squares over all frames: what the pixels of a frame say of its pose, as a Gaussian (`Poses`); third
 differences of position and rotation, which vanish under constant acceleration and spin; differences between
 frames in which the object lies still; and, above a known table, height and tilt of an object that lies or
-slides on one of its faces, and g and free spin where it falls freely. A wrong size of the object moves it
-along the line of sight in all frames alike. Weights of frames, of differences and of what a table says are
-those of Student's and Cauchy's distributions, found again in every step (iteratively reweighted least
-squares).
+slides on one of its faces, and g where it falls freely. A wrong size of the object moves it along the line of
+sight in all frames alike. Weights of frames, of differences and of what a table says are those of Student's
+and Cauchy's distributions, found again in every step (iteratively reweighted least squares).
 """
 
 from collections.abc import Sequence
@@ -28,7 +27,6 @@ from dano.vision.trajectory._support import (
     GRAVITY,
     no_flight,
     Solid,
-    unlike_free_spin,
 )
 
 _STEADY = 0.004
@@ -45,9 +43,6 @@ _BASE, _LEAN = 4e-3, 3e-3
 
 _LOADED = 0.03
 """By how much the centre of mass may lie beside that of an even filling [sizes], one for a film."""
-
-_UNEVEN = 0.1
-"""By how much ratios of moments of inertia may lie beside those of an even filling."""
 
 _ABOVE, _TILTED = 0.06, np.radians(8)
 """Height [sizes] and tilt [rad] up to which an object lies on a face; more, where poses are less certain."""
@@ -305,8 +300,6 @@ class _Problem:
             parts.append(self._steady(poses))
         if len(self._resting):
             parts.append(self._rest(poses))
-        if len(self._flight.threes) and self._solid.inertia is not None:
-            parts.append(self._spinning(poses, self._solid.inertia))
         rows = [self._said(poses, shared[-7:], width)]
         rows += [_spread(frames, slopes, residual) for frames, slopes, residual in parts]
         for k, run in enumerate(self._runs):
@@ -386,18 +379,6 @@ class _Problem:
         self._cost += 0.5 * float(np.sum(change(poses) ** 2))
         return self._linear(change, poses, self._resting, np.ones((len(first), 6)))
 
-    def _spinning(self, poses: Poses, inertia: np.ndarray):
-        """Spin of what falls freely, by Cauchy's distribution: something may push it."""
-
-        def unlike(moved: Poses) -> np.ndarray:
-            return unlike_free_spin(moved.orientation, self._flight, inertia) / _UNEVEN
-
-        square = np.sum(unlike(poses) ** 2, axis=1)
-        weight = 4 / (1 + square / self._tolerance**2)
-        self._cost += 2 * float(np.sum(np.log1p(square)))
-        root = np.sqrt(np.repeat(weight[:, None], 3, axis=1))
-        return self._linear(unlike, poses, self._flight.threes, root)
-
     def _linear(self, function, poses: Poses, frames: Int[np.ndarray, "m k"], root: np.ndarray):
         """Derivatives of residuals by the frames they depend on: (frames, slopes (m, r, k, 6), residuals)."""
         value, count, n = function(poses), frames.shape[1], len(poses.position)
@@ -431,7 +412,7 @@ class _Problem:
 
     def _falling(self, poses: Poses, shared: np.ndarray, column: int) -> "_Part":
         """Acceleration of the centre of mass less g, by Cauchy's distribution: something may push it."""
-        (threes, rates, _), size = self._flight, self._solid.size
+        (threes, rates), size = self._flight, self._solid.size
 
         def pushed(moved: Poses, beside: np.ndarray) -> np.ndarray:
             com = centres_of_mass(moved, self._solid.com + size * beside)
