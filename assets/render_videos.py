@@ -30,6 +30,7 @@ from solids import bunny_mesh, Mesh, soap_mesh
 WIDTH, HEIGHT, FOCAL = 400, 300, 420.0  # [pixels]
 EYE, TARGET = np.array([0.14, -0.42, 0.30]), np.array([0.0, 0.0, 0.03])  # [m]
 RATE, FRAMES = 60.0, 24  # [frames/s]
+STEP = 1e-4  # [s]; contact is eight steps wide: what is in the table would be hidden by it
 GRAVITY = 9.81  # [m/s²]
 LIGHT = np.array([-0.5, -0.35, 0.79])  # towards the sun
 BLOCK = (0.03, 0.05, 0.025)  # half sides of what pushes [m]
@@ -105,9 +106,11 @@ def tumble(
         import mujoco  # pyright: ignore[reportMissingImports]
 
         vertices, _ = film.mesh()
-        points = " ".join(f"{x:.6f}" for x in vertices[::7].ravel())
+        hull = trimesh.PointCloud(vertices).convex_hull.vertices
+        points = " ".join(f"{x:.6f}" for x in hull.ravel())
         spec = mujoco.MjSpec.from_string(f"""
-<mujoco><option timestep="0.0005" cone="elliptic" impratio="10" gravity="0 0 {-GRAVITY}"/>
+<mujoco><option timestep="{STEP}" cone="elliptic" impratio="10" gravity="0 0 {-GRAVITY}"/>
+<default><geom solref="{8 * STEP} 1" solimp="0.99 0.999 0.0001"/></default>
 <asset><mesh name="hull" vertex="{points}"/></asset>
 <worldbody><geom type="plane" size="1 1 1" friction="{film.friction} 0 0" condim="3"/>
 <body name="pusher" mocap="true" pos="0 0 -1"><geom type="box" size="{" ".join(map(str, BLOCK))}" condim="1"/>

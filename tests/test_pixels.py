@@ -220,6 +220,38 @@ def test_friction_is_found_from_pixels(scene, look, watched, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("slid_with", [0.25, 0.36])
+def test_pixels_pull_poses_back_that_are_all_wrong_in_one_direction(scene, look, watched, slid_with):
+    """Poses of another slide: they agree with one another and with the physics, only not with the film."""
+    taken, camera, motion = watched
+    other = scene.replace_contact("ball", "floor", sliding_friction=slid_with)
+    state = scene.initial_state(ball={"position": (-0.2, 0, 0.3), "velocity": (2.0, 0, 0)})
+    told = Motion.from_trajectory(dano.simulate(other, state, 12), bodies=["ball"], every=3)
+    away = np.linalg.norm(told.position[-1, 0] - motion.position[-1, 0])
+    wrong = Motion.create(
+        motion.times,
+        "ball",
+        position=told.position[:, 0],
+        orientation=told.orientation[:, 0],
+        covariance=np.tile(np.diag([away**2] * 3 + [0.05**2] * 3), (len(motion.times), 1, 1)),
+        point="origin",
+    )
+    found = identify_in_film(
+        scene,
+        taken,
+        look,
+        camera,
+        wrong,
+        [dano.Parameter("mu", lambda s: s.contact("ball", "floor").sliding_friction, 0.05, 1.0)],
+        tracking=TrackOptions(masks="given", rays=1500),
+        initial="velocities",
+    )
+    assert float(found.poses.values["mu"]) == pytest.approx(slid_with, rel=0.01)
+    assert float(found.fit.values["mu"]) == pytest.approx(0.3, rel=0.03)
+    assert found.fit.standard_errors["mu"] >= found.poses.standard_errors["mu"]
+
+
+@pytest.mark.slow
 def test_pixels_that_repeat_the_poses_end_the_search(scene, look, watched):
     """Poses that are right leave the pixels nothing to add: one value, one error, one pass."""
     taken, camera, motion = watched

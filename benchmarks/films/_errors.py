@@ -72,6 +72,7 @@ def error_rows(group: str, errors: Errors) -> list[Row]:
         Row(group, "position, median", 100 * float(np.median(errors.beside)), "%"),
         Row(group, "position, largest", 100 * float(errors.beside.max()), "%"),
         Row(group, "turn", float(np.degrees(np.median(turns))), "°"),
+        Row(group, "turn, largest", float(np.degrees(turns.max())), "°"),
         Row(group, "shared", 100 * errors.shift, "%"),
         Row(group, "shared turn", float(np.degrees(errors.turn)), "°"),
         Row(group, "own", 100 * float(np.median(rest)), "%"),

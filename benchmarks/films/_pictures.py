@@ -63,4 +63,6 @@ def _opacity(
     pose[:3, :3], pose[:3, 3] = quat_to_matrix(orientation), position
     seen = np.concatenate([camera.pose[:3], [[0, 0, 0, 1]]])
     around = camera.replaced(camera_to_world=np.linalg.solve(pose, seen))
-    return field.picture(around).opacity.astype(np.float32)
+    # Any light: only the silhouette counts.
+    light = (0.0, 0.0, 1.0) if field.model.appearance.lit else None
+    return field.picture(around, light).opacity.astype(np.float32)

@@ -1,6 +1,7 @@
 """Poses of films against the truth: what all frames share and what each is off by, regions, and friction."""
 
 import argparse
+import dataclasses
 import json
 import sys
 import time
@@ -113,7 +114,7 @@ def _one(name: str, group: str, arguments: argparse.Namespace) -> list[Row]:
         film, camera, empty = without_masks(case.film), case.camera, case.background
         field = known(case.field, name)
         truth = Truth(case.position, case.orientation, case.middle, case.size)
-        options = case.options("object")
+        options = dataclasses.replace(case.options("object"), table=case.table or 0.0)
     else:
         source = learned(folder, kind.toy, quick=arguments.quick)
         drawn = filmed(folder, name, quick=arguments.quick)

@@ -21,6 +21,9 @@ _TAG, TAG_SIDE, TAG_AT = 3, 0.05, np.array([0.105, -0.045])
 _PALE = 0.15
 """Share of a toy that is as pale as the paper."""
 
+_TUNNEL_AT, _TUNNEL = np.array([-0.02, 0.0, 0.032]), np.array([-0.08, -0.82, 0.56])
+"""A point of the axis of a hole through a toy [m], and its direction: a line of sight."""
+
 _RAYS = 2
 """Rays of a pixel, along each side."""
 
@@ -76,23 +79,45 @@ TOYS = {
 
 
 class World:
-    """A toy, a page, and light (host)."""
+    """A toy, a page, and light (host).
 
-    def __init__(self, name: str):
+    Args:
+        name: Of the toy.
+        pale: Share of it that is as pale as the paper.
+        colours: Two linear colours of the rest; default: by chance.
+        plain: Whether nothing is printed on the page.
+        tunnel: Radius of a hole through the toy, as a mask with a hole carves it [m].
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        pale: float = _PALE,
+        colours: Sequence[Sequence[float]] | None = None,
+        plain: bool = False,
+        tunnel: float = 0.0,
+    ):
         toy = TOYS[name]
         self._distance = toy.distance
+        if tunnel:
+            hole = lambda p: np.linalg.norm(np.cross(p - _TUNNEL_AT, _TUNNEL), axis=-1)  # noqa: E731
+            self._distance = lambda p: np.maximum(toy.distance(p), tunnel - hole(p))
         self._low, self._high = np.array(toy.low) - 1e-4, np.array(toy.high) + 1e-4
         self.seed = toy.seed
         rng = np.random.default_rng(1000 + toy.seed)
-        self._page = _with_marker(newspaper(toy.seed))
+        blank = np.broadcast_to(PAPER, (TEXELS, TEXELS, 3))
+        self._page = blank if plain else _with_marker(newspaper(toy.seed))
         self._colours = 0.15 + 0.8 * rng.random((2, 3))
         self._colours[1] = np.clip(self._colours[1] * 0.5, 0.08, 1)
+        if colours is not None:
+            self._colours = np.array(colours)
         texture = int(rng.integers(20, 90))
         self._fine, self._broad = (
             pattern(texture),
             cv2.GaussianBlur(pattern(texture + 2), (0, 0), 8),
         )
-        self._level = np.quantile(self._broad, 1 - _PALE)
+        self._level = np.quantile(self._broad, 1 - pale)
 
     def volume(self) -> float:
         """Of the toy [m³], to some 0.1 %."""
