@@ -303,7 +303,7 @@ def test_a_heavy_body_rests_on_a_light_one():
         dano.Body(*x[:2], mass=x[2]) for x in zip("ab", map(dano.Box, sizes), masses, strict=True)
     )
     stiffness = 1e9
-    params = dano.ContactParams(stiffness=stiffness)
+    params = dano.ContactParams(stiffness=stiffness, hysteresis=0.0)
     contacts = [dano.Contact("b", "a", params), dano.Contact("a", "floor", params)]
     bodies = [light, heavy, dano.Body("floor", dano.HalfSpace(), fixed=True)]
     scene = dano.Scene.create(bodies, contacts, timestep=0.005)
