@@ -12,6 +12,7 @@ from engine.scenes import last, point_cloud_box
 from reference_step.scenes import lump
 
 import dano
+from dano.fields import SignedDistanceGrid
 
 # Code that runs three times slower and compiles in three quarters of the time.
 QUICKLY = {"xla_backend_optimization_level": 0}
@@ -207,7 +208,9 @@ def test_grids_that_round_bodies_hit(shape, height):
         ball=dict(position=(0.005, 0.01, height), velocity=(0.02, 0.01, -0.2), omega=(0.3, 0.2, 0.1)),
         lump=dict(omega=(0.05, -0.1, 0.2)),
     )
-    coefficients = scene.bodies[1].solid.coefficients
+    solid = scene.bodies[1].solid
+    assert isinstance(solid, SignedDistanceGrid)
+    coefficients = solid.coefficients
     rng = np.random.default_rng(3)
     bumps, weights = 1e-3 * rng.normal(size=coefficients.shape), rng.normal(size=(2, 3))
 
