@@ -122,6 +122,33 @@ def test_derivatives_after_two_bodies_meet(on_floor):
     np.testing.assert_allclose(np.asarray(jax.jacfwd(end)(x)), found, rtol=1e-3, atol=1e-5)
 
 
+def test_derivatives_of_a_pair_both_of_whose_sides_wait():
+    """A box strikes the edge of a fixed one: samples of both have part, and both say when impulses act."""
+    bodies = [dano.Body("a", BOX, mass=0.4), dano.Body("b", dano.Box((0.03, 0.02, 0.05)), fixed=True)]
+    params = dano.ContactParams(sliding_friction=0.3, restitution=0.3)
+    scene = dano.Scene.create(bodies, [dano.Contact("a", "b", params)], timestep=2e-3)
+
+    def end(x):
+        start = dict(
+            position=jnp.array([0.004 + x[2], 0.003, 0.095 + x[1]]),
+            velocity=jnp.array([0.05, 0.03, x[3] - 0.6]),
+            orientation=(1, 0.06, 0.04, 0.1),
+            omega=(0.3, 0.5, 0.2),
+        )
+        changed = scene.replace_contact("a", "b", sliding_friction=x[0])
+        states = dano.simulate(changed, changed.initial_state(a=start), 60).states
+        turns = states.omega[-1, 0] @ jnp.array([0.1, 0.2, 0.3])
+        return states.velocity[-1, 0] @ jnp.array([1.0, -2.0, 3.0]) + turns
+
+    x = jnp.array([0.3, 0.0, 0.0, 0.0])
+    steps = 1e-6 * np.eye(4)
+    many = jax.vmap(end)
+    differences = (np.asarray(many(x[None] + steps)) - np.asarray(many(x[None] - steps))) / 2e-6
+    found = np.asarray(jax.grad(end)(x))
+    np.testing.assert_allclose(found, differences, rtol=1e-4)
+    np.testing.assert_allclose(np.asarray(jax.jacfwd(end)(x)), found, rtol=1e-5)
+
+
 @pytest.mark.parametrize("shape", [BOX, dano.Ellipsoid((0.05, 0.04, 0.03))], ids=["box", "ellipsoid"])
 def test_derivatives_after_impacts(shape):
     """By friction, speed, height and depth, against differences of a tiny step; forward mode is the same."""

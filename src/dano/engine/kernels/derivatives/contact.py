@@ -546,16 +546,15 @@ def pull_waiting(
     found: FoundPair,
     twists: Virtual,
     waiting: Waiting,
+    takes: real,
     bar: wp.ref[MetPair],
 ) -> FoundPair:
     """Derivatives by when and how a pair meets whose impulses wait; adds those by its bodies.
 
-    `bar` has those by when impulses on its bodies take effect, of its own, which are used up: it is known.
+    `bar` has those by when impulses on its bodies take effect, of its own, of which it `takes` this share.
     """
     own = waiting
-    own.met += bar.first.met + bar.second.met
-    bar.first.met = ZERO
-    bar.second.met = ZERO
+    own.met += takes * (bar.first.met + bar.second.met)
     apart = apart_at_start(scene, room, world, found)
     by_found, by_apart, _a, _b = wp.grad(waiting_work)(found, apart, twists, own)
     bar.first.position += by_apart
@@ -574,10 +573,11 @@ def pull_pair(
     rebound: real,
     twists: Virtual,
     waiting: Waiting,
+    takes: real,
 ) -> tuple[MetPair, Virtual]:
     """Derivatives by a pair's bodies, for the first lane, and by twists; adds those by all else.
 
-    `rebound` is the share of the restitution that counts.
+    `rebound` is the share of the restitution that counts; for `takes` see `pull_waiting`.
     """
     near = near_pair(scene, world, found.pair)
     a, b = as_they_meet(room.bodies[world, near.first], room.bodies[world, near.second], found, near.h)
@@ -603,7 +603,7 @@ def pull_pair(
         if wp.static(not TREES):
             coming.alone = scene.body_index[near.first].row < 0 or scene.body_index[near.second].row < 0
             if found.impact.stiffness > ZERO:
-                by_met = pull_waiting(scene, room, world, found, twists, waiting, bar)
+                by_met = pull_waiting(scene, room, world, found, twists, waiting, takes, bar)
                 by.impact.delays += by_met.impact.delays
                 by.share += by_met.share
                 support_bar = by_met.support

@@ -25,7 +25,7 @@ from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals, solve_trees
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.pairs import BodyState
-from dano.physics.real import ONE, vec6, ZERO
+from dano.physics.real import HALF, ONE, real, vec6, ZERO
 from dano.physics.structures import after_adjoints, product_of
 
 _LANES = wp.constant(LANES)
@@ -157,6 +157,19 @@ def is_moved_pair(twists: Virtual) -> bool:
 
 
 @wp.func
+def waits_too(scene: wp.ref[Scene], room: wp.ref[Room], world: int, entry: int, other: int, end: int) -> bool:
+    """Whether another entry is the other side of a pair that waits, and waits, too."""
+    if (
+        other < 0
+        or other >= end * _LANES
+        or room.found[world, entry].waits * room.found[world, other].waits == 0
+    ):
+        return False
+    index = scene.pair_index[room.found[world, entry].pair]
+    return scene.pair_index[room.found[world, other].pair].first == index.second
+
+
+@wp.func
 def waiting_bars(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> Waiting:
     """A pair's part of derivatives by when impulses on its bodies take effect, and by what carries them."""
     bars = Waiting()
@@ -196,16 +209,30 @@ def pull_equations(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Laun
     if lane == 0:
         pull_momenta(scene, room, world)
     wait()
-    # When impulses take effect matters to all contact of a body: what has them wait comes last.
-    for k in range(2 * step.n_found):
+    # When impulses take effect matters to all contact of a body: what has them wait comes last. Of two sides
+    # that wait the first one comes again, when it is known what the second one says of the moment of both.
+    for k in range(3 * step.n_found):
+        stage = k // step.n_found
         entry = (k % step.n_found) * _LANES + lane
-        if (room.found[world, entry].waits > 0) == (k >= step.n_found):
-            found = room.found[world, entry]
+        found = room.found[world, entry]
+        again = waits_too(scene, room, world, entry, entry + _LANES, step.n_found)
+        if (found.waits > 0) == (stage > 0) and (stage < 2 or again):
             twists = twists_of_pair(scene, room, world, entry)
             waiting = waiting_bars(scene, room, world, found)
+            takes = real(1.0)
+            if waits_too(scene, room, world, entry, entry - _LANES, step.n_found):
+                takes = HALF
+            if again:
+                takes = ZERO
+                met = waiting.met
+                waiting.met = ZERO
+                if stage == 2:
+                    twists = Virtual()
+                    waiting = Waiting()
+                    waiting.met = met
             if is_moved_pair(twists) or not (waiting_product(waiting, waiting) == ZERO):
                 rebound = launch.reports[world, step.t].rebound
-                bar, by_twists = pull_pair(scene, room, world, lane, found, rebound, twists, waiting)
+                bar, by_twists = pull_pair(scene, room, world, lane, found, rebound, twists, waiting, takes)
                 if lane == 0:
                     add_pair(scene, room, world, found, bar, by_twists)
             wait()
