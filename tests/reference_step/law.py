@@ -74,7 +74,7 @@ def laws_of(scene):
             rest = float(law.stiction_velocity), float(law.implicitness), law.compliant
             F = np.clip(sizes[len(found)] / (2 * delta), 100.0, 1e4)
             rest = *rest, h, delta, F, max(v_e + g * h, (g * delta) ** 0.5), g if g > 0 else 9.81
-            damper = 1000 / (h * sum(inverse[body] for body in scene.point_pairs[len(found)]))
+            damper = 1e4 / (h * sum(inverse[body] for body in scene.point_pairs[len(found)]))
             found.append(Law(k, e, v_e, sigma, mu, phi, p_0, *rest, damper))
     return found
 
