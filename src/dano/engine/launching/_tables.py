@@ -28,7 +28,7 @@ _THIN = 0.25
 _SOFTEST, _HARDEST = 100.0, 1e4
 # Another part of a body, whose impact is left to the next step, gets in by at most this share of the size.
 _DEEPEST = 0.04
-# Hardest damper that a deep sample is in contact that lasts, times the timestep over the common mass: hard steps
+# Hardest damper that a deep sample is in lasting contact, times the timestep over the common mass: hard steps
 # of random piles take 89 passes by it instead of 133. With 1000 a body of 19 kg on one of 100 g sinks in.
 _HARDEST_SAMPLE = 1e4
 _STRUCTURES = "dano.engine.kernels.tables"
