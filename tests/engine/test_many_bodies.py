@@ -96,6 +96,20 @@ def test_bodies_of_another_material_have_rows_of_their_own():
     assert tables.rows["scene.materials"].shape[0] == 4
 
 
+def test_bodies_of_another_mass_have_rows_of_their_own():
+    """How hard a deep sample may be follows from the masses of its pair."""
+    masses = np.array([1.0, 1.0, 5.0])
+    bodies = [dano.Body(f"b{i}", dano.Box((HALF,) * 3), mass=m) for i, m in enumerate(masses)]
+    floor = dano.Body("floor", dano.HalfSpace(), fixed=True)
+    scene = dano.Scene.create([*bodies, floor], others=dano.ContactParams(), timestep=0.005)
+    tables = scene_tables(scene)
+    index = tables.whole.arrays["scene.pair_index"]
+    inverse = np.append(1 / masses, 0.0)
+    hardest = np.asarray(tables.rows["scene.pairs"])[index[:, 3], -1]
+    common = 1 / inverse[index[:, :2]].sum(axis=1)
+    np.testing.assert_allclose(hardest / hardest[0], common / common[0], rtol=1e-12)
+
+
 @unsolved
 def test_shared_rows_change_nothing(monkeypatch):
     scene = boxes()

@@ -327,6 +327,12 @@ def _first_of_each(keys: Int[np.ndarray, " k"]) -> tuple[Int[np.ndarray, " kinds
     return first[order], rank[place]
 
 
+def _inverse_masses(bodies: Sequence[Body], dtype: DTypeLike) -> Float[AnyArray, " n"]:
+    """1/m of bodies [1/kg], zero for those that are fixed."""
+    masses = _column([body.mass * body.mass_scale for body in bodies], dtype)
+    return np.array([not body.fixed for body in bodies], dtype) / masses
+
+
 def _kinds_of_bodies(
     scene: Scene, bodies: Sequence[Body], extents: Float[AnyArray, "n 6"]
 ) -> Int[np.ndarray, " n"]:
@@ -335,9 +341,13 @@ def _kinds_of_bodies(
     Where numbers are traced, derivatives by those of each body may be asked for: then none are alike.
     """
     n = len(bodies)
+    if n == 0:
+        return np.arange(n)
     others = scene.others
-    columns = [] if others is None else jax.tree.leaves((others.params, others.of_edges))
-    if is_traced(extents, columns) or n == 0:
+    columns = [_inverse_masses(bodies, extents.dtype)]
+    if others is not None:
+        columns += jax.tree.leaves((others.params, others.of_edges))
+    if is_traced(extents, columns):
         return np.arange(n)
     told = [
         np.array([body.surface is not None and body.surface.turning != "fixed" for body in bodies]),
@@ -388,13 +398,12 @@ def _pairs(
         return np.zeros((0, 8), dtype)
     first, second, material = index.T[:3]
     smooth = np.array([body.surface is not None and body.surface.turning != "fixed" for body in bodies])
-    masses = _column([body.mass * body.mass_scale for body in bodies], dtype)
-    xp = library(extents, masses, h, scene.gravity, *jax.tree.leaves(groups))
+    inverse = _inverse_masses(bodies, dtype)
+    xp = library(extents, inverse, h, scene.gravity, *jax.tree.leaves(groups))
     size, thickness = xp.minimum(extents[first, 4:], extents[second, 4:]).T
     gravity_step = _strength(scene) * h * h
     depths = _impact_depths(groups, dtype)[material]
     impact_depth = xp.minimum(depths, _THIN * thickness)
-    inverse = np.array([not body.fixed for body in bodies], dtype) / masses
     common = 1 / (inverse[first] + inverse[second])
     return packed(
         features,
