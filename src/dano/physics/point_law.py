@@ -362,10 +362,16 @@ def slip_at(law: PointLaw, slip: vec3, grip: real) -> Slip:
 
 
 @wp.func
+def fitting_direction(law: PointLaw, rate: real) -> real:
+    """The dual s that fits a separating speed."""
+    return rate / wp.max(wp.abs(rate), law.stiction)
+
+
+@wp.func
 def fitting_duals(law: PointLaw, motion: Motion) -> Duals:
     """Duals that fit given velocities."""
     duals = Duals()
-    duals.direction = motion.rate / wp.max(wp.abs(motion.rate), law.stiction)
+    duals.direction = fitting_direction(law, motion.rate)
     duals.friction = traction(law, motion.rate, motion.slip).friction
     return duals
 

@@ -14,6 +14,7 @@ from dano.physics.momentum import angular_momentum, angular_momentum_jacobian
 from dano.physics.pairs import FIXED
 from dano.physics.point_law import (
     Duals,
+    fitting_direction,
     fitting_duals,
     following_duals,
     is_apart,
@@ -371,6 +372,10 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
                 changes = room.changes[world, k]
                 duals.friction = duals.friction + trial.length * changes.friction
                 duals.direction = duals.direction + trial.length * changes.direction
+                if known == 0:
+                    # A point that comes in has no history; 0 would make it as stiff as one that sticks.
+                    duals.direction = fitting_direction(law, motion.rate)
+                    room.duals[world, k].direction = duals.direction
                 held = room.linear[world, k].held
                 linear = linearized(law, motion, duals, trial.softness, trial.holds, trial.mix, held)
                 room.linear[world, k] = linear
