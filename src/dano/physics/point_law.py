@@ -168,7 +168,6 @@ class Linear:
     turning: vec3  # l [Pa s/m], zero where the point sticks
     slip_direction: vec3  # û, unit slip, zero where the point sticks
     by_pressure: vec3  # b′ f c [Pa s/m]
-    held: real  # Largest friction that is held [Pa]
 
 
 @wp.func
@@ -377,33 +376,21 @@ def fitting_duals(law: PointLaw, motion: Motion) -> Duals:
 
 
 @wp.func
-def linearized(
-    law: PointLaw, motion: Motion, duals: Duals, softness: real, holds: bool, mix: real, held: real
-) -> Linear:
+def linearized(law: PointLaw, motion: Motion, duals: Duals, share: real) -> Linear:
     """One linearisation of the law with its duals.
 
     Args:
         law: Constants of the point.
         motion: Of the point.
         duals: The duals.
-        softness: Multiplies the stiction velocity.
-        holds: Whether the largest friction is the one that is held, whatever the pressure.
-        mix: Share of that one which is renewed first, from the pressure as it is.
-        held: That one [Pa].
+        share: Of its friction.
     """
     found = Linear()
-    stiction = law.stiction * softness
-    found.pressure = pressure(law, motion.rate, duals.direction, stiction)
+    found.pressure = pressure(law, motion.rate, duals.direction, law.stiction)
     bound = friction_bound(law, found.pressure.value)
-    limit = bound.value
-    marginal = bound.marginal
-    found.held = held
-    if holds:
-        found.held = held + mix * (limit - held)
-        limit = found.held
-        marginal = ZERO
-    damping = marginal * found.pressure.damping
-    own = friction_with_dual(motion.slip, duals.friction, limit, damping, stiction, law.gradual)
+    limit = share * bound.value
+    damping = share * bound.marginal * found.pressure.damping
+    own = friction_with_dual(motion.slip, duals.friction, limit, damping, law.stiction, law.gradual)
     found.friction = own.value
     found.friction_change = own.change
     found.grip = own.grip
