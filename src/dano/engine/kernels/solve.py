@@ -9,11 +9,10 @@ settled. A solve ends when the residual is small and λ and s fit the velocities
 that of the law, too.
 
 Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after
-each step that made the residual larger; then it begins again, with a line search. Where that cycles, too,
-friction mostly presses a point in, which raises its friction. Then the solve begins again almost without
-friction, where the equations are nearly those of a convex function and a line search finds their root, and
-friction grows to what it is in levels, each from the root of the one before. What does not converge ends
-where its residual was smallest.
+each step that made the residual larger. Where that cycles, too, friction mostly presses a point in, which
+raises its friction. Then the solve begins again, from rest and almost without friction: the equations are
+nearly those of a convex function, and a line search finds their root. Friction grows to what it is in levels,
+each from the root of the one before. What does not converge ends where its residual was smallest.
 """
 
 import warp as wp
@@ -130,14 +129,8 @@ def level_of(number: int) -> Level:
     elif number == 1:
         level.friction = real(0.01)
         level.budget = 80
-    elif number == 2:
-        level.friction = real(0.1)
-        level.budget = 25
-    elif number < 6:
+    elif number < 7:
         level.friction = real(0.1) + real(0.2) * real(number - 2)
-        level.budget = 25
-    elif number == 6:
-        level.friction = real(0.85)
         level.budget = 25
     elif number == 8:
         level.share = real(0.4)
