@@ -7,7 +7,7 @@ import pytest
 
 import dano
 from dano.engine import _rolling
-from dano.engine.launching import _cpu
+from dano.engine.launching import _launch
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ TWICE = (jax.hessian, lambda f: jax.grad(jax.grad(f)), lambda f: jax.jit(jax.hes
 
 @pytest.mark.parametrize("twice", TWICE, ids=["hessian", "gradient of a gradient", "compiled"])
 def test_second_derivatives_are_refused_before_anything_runs(cart, twice, monkeypatch):
-    monkeypatch.setattr(_cpu, "_launcher", lambda *_: pytest.fail("something is launched"))
+    monkeypatch.setattr(_launch, "_launcher", lambda *_: pytest.fail("something is launched"))
     scene, state = cart
 
     def way(friction):

@@ -208,7 +208,7 @@ def test_two_processes_at_once(tmp_path):
 SOURCE = """
 import hashlib, sys
 from dano.native import Features, instance
-from dano.engine.launching._builds import builds
+from dano.engine.launching._tables import builds
 for module in sys.argv[1:]:
     features = builds()[0]
     if "derivatives" in module:

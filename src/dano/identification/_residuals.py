@@ -12,8 +12,8 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.engine import AbstractEngine, compiled, difference, gather, map_rows, retract, simulate
-from dano.identification._parameters import Selection, with_values
 from dano.identification._planes import plane_through, Smoothing
+from dano.identification._settings import Selection, with_values
 from dano.identification._windows import Windows
 from dano.identification.motions import joint_table, QUANTITIES
 from dano.maths import einsum, quat_conjugate, quat_log, quat_multiply, quat_normalize, quat_rotate

@@ -5,6 +5,7 @@ which needs neither Warp's Python code, which takes a second to import, nor the 
 another to run. Both are asked for only where an object has to be made.
 """
 
+import concurrent.futures
 import ctypes
 import functools
 import hashlib
@@ -16,13 +17,12 @@ import platform
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from dano.caches import cache_folder, cache_place
-from dano.native._declared import modules_behind, source_of
-from dano.native._instances import Features, instance
+from dano.native._instances import Features, instance, modules_behind, source_of
 from dano.native._layout import ArrayField, Layout, layout_of, NumberField, Parameters
 from dano.native._warp import compile_object, FLAGS
 
@@ -73,6 +73,25 @@ class KernelLaunch:
     def __call__(self) -> None:
         """Launch."""
         self._call(*self._given)
+
+
+@functools.cache
+def n_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def together(works: Sequence[Callable[[], object]]) -> None:
+    """Do some works that leave Python's lock, the first of them in this thread; returns when all are done."""
+    others = [_workers().submit(work) for work in works[1:]]
+    works[0]()
+    for other in others:
+        other.result()
+
+
+@functools.cache
+def _workers() -> concurrent.futures.ThreadPoolExecutor:
+    return concurrent.futures.ThreadPoolExecutor(max(1, n_cores() - 1), thread_name_prefix="dano")
 
 
 # One thread makes objects at a time: Warp's code and Python's parser are for one.

@@ -44,7 +44,7 @@ def check_contacts(bodies: Sequence[Body], joints: Sequence[Joint], contacts: Se
         ValueError: If not, or if the joints make no trees.
     """
     names = [body.name for body in bodies]
-    layout = layout_of(*structure(bodies, joints))
+    layout = layout_of(bodies, joints)
     seen: set[frozenset[str]] = set()
     for contact in contacts:
         for name in (contact.a, contact.b):
@@ -75,15 +75,6 @@ def sampled_alike(bodies: Sequence[Body], twins: Sequence[int]) -> tuple[int, ..
         if body.object is not None or body.surface is None
         else first.setdefault(id(body.surface.points), i)
         for i, body in enumerate(bodies)
-    )
-
-
-def structure(bodies: Sequence[Body], joints: Sequence[Joint]):
-    """Arguments of `layout_of`."""
-    return (
-        tuple(body.name for body in bodies),
-        tuple(body.fixed for body in bodies),
-        tuple((joint.parent, joint.child, joint.kind, joint.mimics) for joint in joints),
     )
 
 

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.checks import checked_count
-from dano.engine._controls import check_control
-from dano.engine._rollout import AbstractEngine
+from dano.engine._engines import AbstractEngine
+from dano.engine._rollout import check_control
 from dano.engine.batches._kernel import Inputs, Kept, Program
 from dano.maths import is_traced
 from dano.scene import Control, Scene, State

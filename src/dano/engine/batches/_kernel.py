@@ -10,10 +10,9 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
-from dano.engine._compiling import compiled
-from dano.engine._reports import Report
-from dano.engine._rollout import AbstractEngine
-from dano.engine.batches._devices import map_rows
+from dano.compiling import compiled, map_rows
+from dano.engine._engines import AbstractEngine
+from dano.engine.launching import Report
 from dano.scene import Control, Scene, State
 
 

@@ -14,9 +14,9 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from dano.checks import checked_count, checked_path, checked_progress
-from dano.engine._controls import Policy
-from dano.engine._rollout import AbstractEngine, checked_engine
-from dano.engine.batches._devices import device_mesh, gather, meet, put_rows, put_whole, take_rows
+from dano.compiling import device_mesh, gather, meet, put_rows, put_whole, take_rows
+from dano.engine._engines import AbstractEngine, checked_engine
+from dano.engine._rollout import Policy
 from dano.engine.batches._input import checked_job, Job
 from dano.engine.batches._kernel import Kept, simulate_rows
 from dano.engine.batches._store import RolloutStore
