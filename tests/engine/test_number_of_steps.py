@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dano
-from dano.engine import _rolling
+from dano.engine import _rollout
 from dano.engine.launching import _launch
 
 
@@ -67,7 +67,7 @@ def test_rollouts(cart, compilations):
 
 def test_policies(cart, compilations, monkeypatch):
     """Rows are made some at a time; the rest of the last ones is left out."""
-    monkeypatch.setattr(_rolling, "_ROWS", 8)
+    monkeypatch.setattr(_rollout, "_ROWS", 8)
     scene, state = cart
 
     def policy(state, time):
