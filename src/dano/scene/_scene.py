@@ -19,17 +19,22 @@ from dano.contact import checked_parameter, ContactParams, Distance, distance, D
 from dano.names import did_you_mean
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
-from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, started, state_arrays
 from dano.scene._contacts import Contact, prepared
 from dano.scene._doubts import doubts_of_scene, doubts_of_state, say_doubts, SceneDoubt
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
 from dano.scene._joints import check_loops, Joint, layout_of, Loop, Loops, loops_of, Motor, StateLayout
 from dano.scene._making import (
+    ByName,
     check_contacts,
     check_materials,
     check_names,
+    control_arrays,
+    joint_arrays,
+    merged,
     room_for,
     sampled_alike,
+    started,
+    state_arrays,
     twins_of,
     warn_of_limits,
     warn_of_long_steps,
