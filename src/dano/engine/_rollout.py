@@ -420,7 +420,7 @@ def _in_turn(engine: Any, scene: Scene, prepared: Any, state: State, policy: Any
     for first in range(0, n_steps, _ROWS):
         count = min(_ROWS, n_steps - first)
         now, rows = _jitted_rows(engine, scene, prepared, now, policy, np.int32(first), np.int32(count))
-        parts.append(_first_rows(rows, count))
+        parts.append(rows if count == _ROWS else _cut(rows, count))
     states, report = _joined(parts)
     return with_start(state, states), report
 
@@ -454,10 +454,6 @@ def _jitted_rows(
 @by_numpy_on_cpus
 def _joined(parts: list[Any]) -> Any:
     return jax.tree.map(lambda *x: library(*x).concatenate(x), *parts)
-
-
-def _first_rows(rows: Any, count: int) -> Any:
-    return rows if count == _ROWS else _cut(rows, count)
 
 
 @by_numpy_on_cpus
