@@ -143,6 +143,15 @@ def falling(body: BodyState, falls: int) -> BodyState:
 
 
 @wp.func
+def is_with_fixed(first: BodyState, second: BodyState) -> bool:
+    """Whether one body of a pair is fixed: their impulses may wait until they meet; on joints none do."""
+    fixed = bool(False)
+    if wp.static(not TREES):
+        fixed = first.inverse_mass == ZERO or second.inverse_mass == ZERO
+    return fixed
+
+
+@wp.func
 def falling_bar(bar: BodyState, falls: int) -> BodyState:
     """Derivatives by a body from those by what `falling` makes of it."""
     found = bar

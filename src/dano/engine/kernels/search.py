@@ -54,6 +54,7 @@ from dano.physics.impacts import (
 from dano.physics.pairs import (
     BodyState,
     falling,
+    is_with_fixed,
     PairPose,
     speed_within,
 )
@@ -335,8 +336,7 @@ class Coming:
     Attributes:
         met: When.
         lasts: Whether its contact lasts: it has no impact.
-        alone: Whether one of the bodies is fixed.
-        waits: Whether impulses may wait until the bodies meet.
+        alone: Whether one of the bodies is fixed: impulses may wait until they meet.
         rest: What it rests on when the step begins.
         support: Impulse of that, see `FoundPair.support`.
     """
@@ -344,7 +344,6 @@ class Coming:
     met: Meeting
     lasts: bool
     alone: bool
-    waits: bool
     rest: Rest
     support: vec6
 
@@ -372,11 +371,9 @@ def coming_of(
     slow = pair.h * material.bounce
     limits = limits_of(pair.numbers.impact_depth, slow, slow, ZERO)
     coming = Coming()
-    if wp.static(not TREES):
-        coming.alone = scene.body_index[pair.first].row < 0 or scene.body_index[pair.second].row < 0
-        if coming.alone:
-            limits.since = -ONE
-    coming.waits = coming.alone
+    coming.alone = is_with_fixed(a, b)
+    if coming.alone:
+        limits.since = -ONE
     coming.lasts = material.instant == ZERO
     if not coming.lasts:
         coming.met = meeting(scene, room, world, lane, pair, falling(a, 1), falling(b, 1), limits)
@@ -404,18 +401,15 @@ def coming_of(
 
 
 @wp.func
-def impact_of(
-    a: BodyState, b: BodyState, material: Material, found: FoundPair, pair: NearPair, coming: Coming
-) -> Impact:
+def impact_of(a: BodyState, b: BodyState, material: Material, found: FoundPair, pair: NearPair) -> Impact:
     """The impact of a pair with a patch, in place of none; still none where it approaches slowly.
 
     Args:
         a: First body.
         b: Second body.
         material: Of the contact.
-        found: What is found of the pair.
+        found: What is found of the pair; its impulses wait if it says so.
         pair: The pair.
-        coming: How it comes to meet.
     """
     impact = found.impact
     if found.patch.load > ZERO:
@@ -423,9 +417,9 @@ def impact_of(
         if impact.share > ZERO and found.hits > 0:
             factor = pair.numbers.factor
             impact.stiffness = stiffness_of_impact(a, b, found.patch, material.bounce, factor, pair.h)
-            impact = delayed(impact, wp.where(coming.waits, impact.share, ZERO), found.share, pair.h)
+            impact = delayed(impact, wp.where(found.waits > 0, impact.share, ZERO), found.share, pair.h)
             impact.rests = left_out(found, factor)
-            if coming.alone:
+            if is_with_fixed(a, b):
                 impact.turns = turning_after(a, b, found.patch, material.friction, found.share, pair.turning)
     return impact
 
@@ -478,7 +472,9 @@ def find_pair(
         found.patch = listed.patch
         found.impact = no_impact(numbers.impact_depth, numbers.factor, numbers.deepest, pair.h)
         if not lasts:
-            found.impact = impact_of(seen, other, material, found, pair, coming)
+            found.waits = wp.where(coming.alone, 1, 0)
+            found.impact = impact_of(seen, other, material, found, pair)
+        found.waits = wp.where(found.impact.delays > ZERO, 1, 0)
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share

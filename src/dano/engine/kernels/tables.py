@@ -210,6 +210,7 @@ class FoundPair:
     hits: wp.int32  # 1 where τ is when the bodies are as deep as in an impact
     falls: wp.int32  # 1 where both fall freely until they meet: then gravity takes part in their way
     waits: wp.int32  # 1 where impulses of an impact take effect when the bodies meet
+    other: wp.int32  # 1 or −1 where the next pair or the one before is the other side of its impact, else 0
     impact: Impact  # Of the pair
     patch: Patch  # Its samples that have sunk in
     rest: Rest  # Samples that it rests on when the step begins, where it has an impact, too

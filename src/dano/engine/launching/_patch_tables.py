@@ -105,8 +105,6 @@ def patch_tables(
     Raises:
         ValueError: If kernels do not know a law or a field, or a pair has nothing to sum over.
     """
-    if not pairs:
-        return PatchRows({}, {}, [], _integers([], 5), False)
     samples, fields = _Samples(dtype, twins), _Fields(dtype, n_leaves, twins)
     contacts, materials, sides, side_index, index = [], [], [], [], []
     for k, pair in enumerate(pairs):
