@@ -23,8 +23,8 @@ from dano.physics.trees.loops import Loop
 
 BLOCK = 16
 """Samples of a block."""
-RUN = 4
-"""Blocks that the search looks at together first."""
+RUN, LEVELS = 4, 3
+"""Blocks that the search looks at together: 4, 16 and 64, the most first."""
 
 
 @wp.struct
@@ -97,7 +97,8 @@ class Scene:
         samples: Of all bodies, in blocks, shape (worlds, samples).
         balls: Centre [m, F] and radius [m] of a ball around each block, shape (worlds, blocks).
         slabs: Mean unit normal [F] of each block, and how far along it samples are from its centre [m].
-        runs: Balls around each block and those after it, `RUN` in all.
+        runs: Balls around blocks of a body that follow each other. Beside its k-th block, for k a multiple of
+            `RUN`, that around `RUN` of them; beside the next, for k a multiple of `RUN`², around `RUN`²; ….
         solids: What samples press on.
         n_pressing: Pairs with samples that press.
         pairs: Of pairs that differ, shape (worlds, kinds of pairs).
@@ -330,6 +331,8 @@ class Room:
         linear: The law as it was linearised last.
         near: Blocks whose samples may meet a solid within the step, of each lane a part.
         until: Share of the step before which none of such a block does.
+        some: Blocks of the pair that is looked at that may be near.
+        bound: Beneath the clearance of their samples when the step begins [m].
         blocks: Of the Jacobian, those that are not zero, row by row, shape (worlds, blocks · blocks + 1).
         spare: The same, used up by the solve.
         used: Of each row and column the place of its block, from 1 on, or 0.
@@ -393,6 +396,8 @@ class Room:
     linear: wp.array2d(dtype=Linear)
     near: wp.array2d(dtype=wp.int32)
     until: wp.array2d(dtype=real)
+    some: wp.array2d(dtype=wp.int32)
+    bound: wp.array2d(dtype=real)
     blocks: wp.array2d(dtype=mat66)
     spare: wp.array2d(dtype=mat66)
     used: wp.array2d(dtype=wp.int32)

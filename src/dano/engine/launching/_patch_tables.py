@@ -211,7 +211,7 @@ class _Samples:
         return {
             "scene.patches.samples": jnp.concatenate([*joined, none]),
             "scene.patches.balls": jnp.concatenate([*balls, none]),
-            "scene.patches.runs": jnp.concatenate([*map(balls_around_runs, balls), none]),
+            "scene.patches.runs": jnp.concatenate([*(balls_around_runs(b, [len(b)]) for b in balls), none]),
         }
 
 

@@ -202,7 +202,7 @@ def _room_of(tables: Tables, shapes: dict[str, Shape], n: int, points: int) -> d
         "lasting": 1,
         **dict.fromkeys(("where", "points", "laws", "gates", "marks", "duals", "changes", "linear"), points),
         **dict.fromkeys(("found", "sorted_pairs"), found),
-        **dict.fromkeys(("near", "until"), most),
+        **dict.fromkeys(("near", "until", "some", "bound"), most),
     }
     if "scene.partners" in whole:
         pairs = tables.numbers["scene.n_pressing"]

@@ -251,7 +251,7 @@ def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
         "scene.samples": xp.concatenate([points_of, vectors], axis=1),
         "scene.balls": balls,
         "scene.slabs": native.slabs_of_blocks(points_of, vectors, centers),
-        "scene.runs": native.balls_around_runs(balls),
+        "scene.runs": native.balls_around_runs(balls, [s.radii.shape[0] for s in sets]),
     }
     return rows, index
 
