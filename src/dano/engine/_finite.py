@@ -143,8 +143,8 @@ def marked(
         report: Of the steps, with a leading axis.
     """
     xp = library(*jax.tree.leaves((holds, state, controls, states, report)))
-    # A sum is finite only where all of its parts are: half of the operations, and XLA on a CPU computes programs
-    # of less than 1,000 of them in the thread that asks, at once.
+    # A sum is finite only where all of its parts are: half of the operations, and XLA on a CPU computes
+    # programs of less than 1,000 of them in the thread that asks, at once.
     known = sum(xp.sum(x) for x in jax.tree.leaves(state))
     rows = [*jax.tree.leaves(states), *jax.tree.leaves(controls)]
     fine = xp.isfinite(sum(xp.sum(x.reshape(x.shape[0], -1), axis=1) for x in rows))
