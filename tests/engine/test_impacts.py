@@ -117,9 +117,9 @@ def test_derivatives_after_two_bodies_meet(on_floor):
     many = jax.vmap(end)
     differences = (np.asarray(many(x[None] + steps)) - np.asarray(many(x[None] - steps))) / 2e-6
     found = np.asarray(jax.grad(end)(x))
-    # Edges are so stiff that all three solves leave rounding: after the third impact 2e-4.
-    np.testing.assert_allclose(found, differences, rtol=1e-3, atol=1e-6)
-    np.testing.assert_allclose(np.asarray(jax.jacfwd(end)(x)), found, rtol=1e-3, atol=1e-5)
+    # Edges are so stiff that all three leave rounding: after the third impact up to 1e-4, before it 1e-8.
+    np.testing.assert_allclose(found, differences, rtol=3e-4, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(jax.jacfwd(end)(x)), found, rtol=3e-4, atol=1e-5)
 
 
 def test_derivatives_of_a_pair_both_of_whose_sides_wait():

@@ -30,14 +30,13 @@ def traction(law: PointLaw, rate: real, slip: vec3) -> Traction:
 
 
 @wp.func
-def linearized(
-    law: PointLaw, motion: Motion, duals: Duals, softness: real, holds: bool, mix: real, held: real
-) -> Linear:
+def linearized(law: PointLaw, motion: Motion, duals: Duals, share: real) -> Linear:
     found = Linear()
-    found.pressure = pressure(law, motion.rate, duals.direction, law.stiction * softness)
-    found.grip = law.numbers[0] * found.pressure.value
+    found.pressure = pressure(law, motion.rate, duals.direction, law.stiction)
+    drag = share * law.numbers[0]
+    found.grip = drag * found.pressure.value
     found.friction = -found.grip * motion.slip
-    found.by_pressure = (law.numbers[0] * found.pressure.damping) * motion.slip
+    found.by_pressure = (drag * found.pressure.damping) * motion.slip
     return found
 '''
 

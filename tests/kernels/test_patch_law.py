@@ -60,10 +60,7 @@ def press(
     wrenches[i, j] = law.patch_law(material, patch, pulls, velocity, spin)
     motion = law.patch_motion(patch.normal, velocity, spin)
     duals = law.fitting_patch_duals(material, patch.overlap, pulls, motion)
-    zero = wp.float64(0.0)
-    linear = law.linearized_patch(
-        material, patch.overlap, pulls, motion, duals, wp.float64(1.0), False, zero, zero
-    )
+    linear = law.linearized_patch(material, patch.overlap, pulls, motion, duals, wp.float64(1.0))
     linear_wrenches[i, j] = law.patch_wrench(material, patch.normal, motion, linear)
     jacobians[i, j] = law.patch_jacobian(material, patch.normal, motion, linear)
 

@@ -143,9 +143,9 @@ def _in_blocks(points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]
 
 
 def _spatial_order(points: np.ndarray) -> np.ndarray:
-    """Permutation that makes each run of `BLOCK` points compact: recursive splits of the longest extent.
+    """Permutation that makes each run of `BLOCK` points compact: recursive halves of the longest extent.
 
-    The first part of a split has a power of two blocks, so that 4, 16, 64, … blocks from a multiple on are
+    Parts begin at multiples of 64, 16 or 4 blocks as long as they have more, so that runs of as many are
     compact, too.
     """
 
@@ -155,7 +155,8 @@ def _spatial_order(points: np.ndarray) -> np.ndarray:
         x = points[index]
         axis = int(np.argmax(x.max(axis=0) - x.min(axis=0)))
         blocks = -(-len(index) // BLOCK)
-        left = BLOCK << ((blocks - 1).bit_length() - 1)
+        unit = next(size for size in (64, 16, 4, 1) if blocks > size)
+        left = BLOCK * unit * -(-blocks // (2 * unit))
         part = np.argsort(x[:, axis], kind="stable")
         return split(index[part[:left]]) + split(index[part[left:]])
 
