@@ -350,7 +350,7 @@ def solve_island(
             wait()
         seen = measure(scene, room, world, lane, island)
         # Far from a root everything is large, what rounding leaves there, too.
-        rounded = wp.min(real(64.0) * options.rounding * seen.size, options.fit * (ONE + size))
+        rounded = wp.min(real(16.0) * options.rounding * seen.size, options.fit * (ONE + size))
         tolerance = wp.max(options.tolerance * (ONE + size), rounded)
         whole = level.friction == ONE
         enough = tolerance
