@@ -3,10 +3,10 @@
 Least squares over all frames: what the pixels of a frame say of its pose, as a Gaussian (`Poses`); third
 differences of position and rotation, which vanish under constant acceleration and spin; differences between
 frames in which the object lies still; and, above a known table, height and tilt of an object that lies or
-slides on one of its faces, and g and a free spin where it falls freely. A wrong size of the object moves it
-along the line of sight in all frames alike. Weights of frames, of differences and of what a table says are
-those of Student's and Cauchy's distributions, found again in every step (iteratively reweighted least
-squares).
+slides on one of its faces, that it is not in the table, and g and a free spin where it falls freely. A wrong
+size of the object moves it along the line of sight in all frames alike. Weights of frames, of differences and
+of what a table says are those of Student's and Cauchy's distributions, found again in every step (iteratively
+reweighted least squares).
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
+from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate, quat_to_matrix
 from dano.vision.trajectory._poses import Poses, stretches
 from dano.vision.trajectory._support import (
     AIR,
@@ -43,6 +43,10 @@ _LEVEL, _FLAT = 1.5e-3, 2e-3
 
 _BASE, _LEAN = 4e-3, 3e-3
 """By how much the learned face may lie beside the true one: height [sizes] and tilt [rad], one for a film."""
+
+_SUNK = 0.01
+"""Depth in the table from which frames are not believed [sizes]. With none, errors of frames would lift a
+thing that touches it: only those below the table count."""
 
 _LOADED = 0.03
 """By how much the centre of mass may lie beside that of an even filling [sizes], one for a film."""
@@ -162,7 +166,7 @@ def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> 
 
     def solved_with(factor: np.ndarray) -> _Solved:
         more = seen.covariance * factor[:, None, None]
-        return problem.solved(seen._replace(covariance=more), runs, flight, scenery.table or 0.0)
+        return problem.solved(seen._replace(covariance=more), runs, flight, scenery.table)
 
     solved = solved_with(factor)
     while factor[0] < _LARGEST:
@@ -301,9 +305,9 @@ class _Problem:
         self._tolerance, self._cost = 1.0, 0.0
         self._runs: list[_Run] = []
         self._flight = no_flight()
-        self._table = 0.0
+        self._table: float | None = None
 
-    def solved(self, poses: Poses, runs: list[_Run], flight: Flight, table: float = 0.0) -> "_Solved":
+    def solved(self, poses: Poses, runs: list[_Run], flight: Flight, table: float | None = None) -> "_Solved":
         """The minimum, given poses of frames, and where it lies or falls.
 
         Single wrong frames and blows both break a steady motion. At first differences keep their weight,
@@ -366,6 +370,8 @@ class _Problem:
         if self._spins:
             column += 3
             rows.append(self._spinning(poses, shared[column : column + 6], 6 * n + column))
+        if self._table is not None:
+            rows.append(_spread(*self._outside(poses, self._table)))
         rows.append(self._prior(shared, width))
         return _joined(rows, width), np.concatenate([part.residual for part in rows])
 
@@ -409,10 +415,13 @@ class _Problem:
 
     def _said(self, poses: Poses, alike: Float[np.ndarray, "7"], width: int) -> "_Part":
         """What frames say, weighted as by Student's distribution; as by that of Gauss if they are sure."""
+        # What is wrong in all frames alike belongs to where it lies.
+        lying = np.zeros((len(poses.position), 1))
+        lying[[k for run in self._runs for k in run.rows]] = 1.0
 
         def away(moved: Poses, alike: np.ndarray = alike) -> np.ndarray:
             apart = difference(self._poses, self.seen(moved, alike[-1])) / self._unit
-            return np.einsum("nij,...nj->...ni", self._roots, apart) + alike[:6]
+            return np.einsum("nij,...nj->...ni", self._roots, apart) + lying * alike[:6]
 
         residual = away(poses)
         square = np.sum(residual**2, axis=1)
@@ -442,6 +451,23 @@ class _Problem:
         weight = 4 / (1 + squares / self._tolerance**2)
         self._cost += 2 * float(np.sum(np.log1p(squares)))
         return self._linear(jerk, poses, self._fours, np.sqrt(np.repeat(weight, 3, axis=1)))
+
+    def _outside(self, poses: Poses, table: float):
+        """How deep the lowest corner of what does not lie there is in the table, where it cannot be."""
+        lies = np.isin(np.arange(len(poses.position)), [k for run in self._runs for k in run.rows])
+        rows, corners = np.flatnonzero(~lies), self._solid.corners
+        heights = quat_to_matrix(poses.orientation[rows])[:, 2] @ corners.T
+        lowest = corners[np.argmin(heights, axis=1)]
+
+        def under(moved: Poses) -> np.ndarray:
+            turn = moved.orientation[..., rows, :]
+            height = moved.position[..., rows, :] + quat_rotate(
+                turn, np.broadcast_to(lowest, (*turn.shape[:-1], 3))
+            )
+            return np.minimum((height[..., 2:] - table) / self._solid.size + _SUNK, 0) / _BASE
+
+        self._cost += 0.5 * float(np.sum(under(poses) ** 2))
+        return self._linear(under, poses, rows[:, None], np.ones((len(rows), 1)))
 
     def _rest(self, poses: Poses):
         """What changes between frames in which nothing moves."""
