@@ -44,7 +44,7 @@ _LEVEL, _FLAT = 1.5e-3, 2e-3
 _BASE, _LEAN = 4e-3, 3e-3
 """By how much the learned face may lie beside the true one: height [sizes] and tilt [rad], one for a film."""
 
-_SUNK = 0.01
+_SUNK = 2 * _BASE
 """Depth in the table from which frames are not believed [sizes]. With none, errors of frames would lift a
 thing that touches it: only those below the table count."""
 
