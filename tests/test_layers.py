@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Set
 from pathlib import Path
 
@@ -147,3 +149,31 @@ def _imported(path: Path, names: Set[str]) -> set[str]:
             if node.func.attr == "import_module" and node.args and isinstance(node.args[0], ast.Constant):
                 found.add(str(node.args[0].value))
     return found
+
+
+FIRST = """
+import sys
+from pathlib import Path
+import dano
+
+ball = dano.Body("ball", dano.Sphere(0.05), mass=1.0)
+scene = dano.Scene.create([ball, dano.Body("floor", dano.HalfSpace(), fixed=True)])
+state, root, seen = scene.initial_state(ball={"position": (0, 0, 0.2)}), Path(dano.__file__).parent, set()
+
+def look(frame, event, _):
+    file, name = Path(frame.f_code.co_filename), frame.f_code.co_name
+    if event == "call" and file.is_relative_to(root) and name != "<module>":
+        seen.add(file.relative_to(root))
+
+sys.setprofile(look)
+dano.simulate(scene, state, 5)
+sys.setprofile(None)
+print(len({file for file in seen if file.parts[0] != "physics" and "kernels" not in file.parts}))
+"""
+
+
+def test_a_first_simulation_goes_through_few_files():
+    """Who follows a call reads these files, besides kernels and formulas."""
+    ran = subprocess.run([sys.executable, "-c", FIRST], capture_output=True, text=True, check=True)
+    # One of them only where no object is there for this processor, and one is made.
+    assert int(ran.stdout.split()[-1]) <= 22

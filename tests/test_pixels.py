@@ -187,30 +187,35 @@ def watched(scene, look):
     return taken, camera, motion
 
 
+def tracked(motion, deviation, noise: np.ndarray | float = 0.0):
+    """Poses as tracking gives them, with this deviation of positions [m], and noise added to these."""
+    return Motion.create(
+        motion.times,
+        "ball",
+        position=motion.position[:, 0] + noise,
+        orientation=motion.orientation[:, 0],
+        covariance=np.tile(np.diag([deviation**2] * 3 + [0.05**2] * 3), (len(motion.times), 1, 1)),
+        point="origin",
+    )
+
+
+def friction_in(scene, taken, look, camera, motion):
+    """What poses and pixels say of the friction between ball and floor."""
+    friction = dano.Parameter("mu", lambda s: s.contact("ball", "floor").sliding_friction, 0.05, 1.0)
+    options = TrackOptions(masks="given", rays=1500)
+    return identify_in_film(
+        scene, taken, look, camera, motion, [friction], tracking=options, initial="velocities"
+    )
+
+
 @pytest.mark.slow
 def test_friction_is_found_from_pixels(scene, look, watched, tmp_path):
     taken, camera, motion = watched
     random = np.random.default_rng(1)
     # Poses that are wrong by 5 % of the ball's radius tell friction badly; the pixels tell it well.
-    rough = Motion.create(
-        motion.times,
-        "ball",
-        position=motion.position[:, 0] + 0.015 * random.normal(size=(len(motion.times), 3)) * [1, 0, 0],
-        orientation=motion.orientation[:, 0],
-        covariance=np.tile(np.diag([0.015**2] * 3 + [0.05**2] * 3), (len(motion.times), 1, 1)),
-        point="origin",
-    )
-    friction = dano.Parameter("mu", lambda s: s.contact("ball", "floor").sliding_friction, 0.05, 1.0)
-    found = identify_in_film(
-        scene,
-        taken,
-        look,
-        camera,
-        rough,
-        [friction],
-        tracking=TrackOptions(masks="given", rays=1500),
-        initial="velocities",
-    )
+    noise = 0.015 * random.normal(size=(len(motion.times), 3)) * [1, 0, 0]
+    rough = tracked(motion, 0.015, noise)
+    found = friction_in(scene, taken, look, camera, rough)
     before, after = (float(fit.values["mu"]) for fit in (found.poses, found.fit))
     assert abs(after / 0.3 - 1) < 0.02
     assert abs(after - 0.3) < 0.5 * abs(before - 0.3)
@@ -228,24 +233,7 @@ def test_pixels_pull_poses_back_that_are_all_wrong_in_one_direction(scene, look,
     state = scene.initial_state(ball={"position": (-0.2, 0, 0.3), "velocity": (2.0, 0, 0)})
     told = Motion.from_trajectory(dano.simulate(other, state, 12), bodies=["ball"], every=3)
     away = np.linalg.norm(told.position[-1, 0] - motion.position[-1, 0])
-    wrong = Motion.create(
-        motion.times,
-        "ball",
-        position=told.position[:, 0],
-        orientation=told.orientation[:, 0],
-        covariance=np.tile(np.diag([away**2] * 3 + [0.05**2] * 3), (len(motion.times), 1, 1)),
-        point="origin",
-    )
-    found = identify_in_film(
-        scene,
-        taken,
-        look,
-        camera,
-        wrong,
-        [dano.Parameter("mu", lambda s: s.contact("ball", "floor").sliding_friction, 0.05, 1.0)],
-        tracking=TrackOptions(masks="given", rays=1500),
-        initial="velocities",
-    )
+    found = friction_in(scene, taken, look, camera, tracked(told, away))
     assert float(found.poses.values["mu"]) == pytest.approx(slid_with, rel=0.01)
     assert float(found.fit.values["mu"]) == pytest.approx(0.3, rel=0.03)
     assert found.fit.standard_errors["mu"] >= found.poses.standard_errors["mu"]
@@ -257,24 +245,7 @@ def test_pixels_pull_poses_back_that_are_all_wrong_in_one_direction(scene, look,
 def test_pixels_that_repeat_the_poses_end_the_search(scene, look, watched):
     """Poses that are right leave the pixels nothing to add: one value, one error, one pass."""
     taken, camera, motion = watched
-    right = Motion.create(
-        motion.times,
-        "ball",
-        position=motion.position[:, 0],
-        orientation=motion.orientation[:, 0],
-        covariance=np.tile(np.diag([0.015**2] * 3 + [0.05**2] * 3), (len(motion.times), 1, 1)),
-        point="origin",
-    )
-    found = identify_in_film(
-        scene,
-        taken,
-        look,
-        camera,
-        right,
-        [dano.Parameter("mu", lambda s: s.contact("ball", "floor").sliding_friction, 0.05, 1.0)],
-        tracking=TrackOptions(masks="given", rays=1500),
-        initial="velocities",
-    )
+    found = friction_in(scene, taken, look, camera, tracked(motion, 0.015))
     assert found.settled and len(found.history) == 2
     assert found.fit is found.poses
     assert abs(float(found.fit.values["mu"]) / 0.3 - 1) < 0.02

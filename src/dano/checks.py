@@ -190,5 +190,5 @@ def _known_as(kind: type) -> str:
     package = kind.__module__.split("._")[0]
     if package == "builtins":
         return kind.__name__
-    public = getattr(sys.modules.get("dano"), kind.__name__, None) is kind
+    public = vars(sys.modules["dano"]).get(kind.__name__) is kind
     return f"dano.{kind.__name__}" if public else f"{package}.{kind.__name__}"

@@ -6,9 +6,7 @@ import pytest
 import dano
 from dano.comparison import compare
 from dano.comparison._bodies import Drop, GRAVITY, Probes, Rigid
-from dano.comparison._mujoco import MuJoCo
-from dano.comparison._own import Own
-from dano.comparison._pybullet import PyBullet
+from dano.comparison._engines import MuJoCo, Own, PyBullet
 from dano.exchange import convex_hull
 from dano.maths import Pose
 from dano.report import verdict

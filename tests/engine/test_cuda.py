@@ -11,8 +11,7 @@ import pytest
 import warp as wp
 
 import dano
-from dano.engine._reports import SolverOptions
-from dano.engine.launching import _cpu, _cuda, _tables, listed_points, rollout, scene_tables
+from dano.engine.launching import _cuda, _launch, _tables, listed_points, rollout, scene_tables, SolverOptions
 from dano.native import begin, Features, instance
 
 N_STEPS, ROOM = 4, 16
@@ -54,7 +53,7 @@ def in_lanes(monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(wp.config, "enable_cpu_blocks", True)
             patch.setattr(_cuda._Blocks, "launch", launched)
-            patch.setattr(_cpu, "call", lambda *given: _cuda.call(*given, platform="cpu"))
+            patch.setattr(_launch, "call", lambda *given: _cuda.call(*given, platform="cpu"))
             jax.clear_caches()
             found = jax.block_until_ready(function(*args))
         jax.clear_caches()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import dano
-from dano.engine import _rolling
-from dano.engine.launching import _cpu
+from dano.engine import _rollout
+from dano.engine.launching import _launch
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_rollouts(cart, compilations):
 
 def test_policies(cart, compilations, monkeypatch):
     """Rows are made some at a time; the rest of the last ones is left out."""
-    monkeypatch.setattr(_rolling, "_ROWS", 8)
+    monkeypatch.setattr(_rollout, "_ROWS", 8)
     scene, state = cart
 
     def policy(state, time):
@@ -121,7 +121,7 @@ TWICE = (jax.hessian, lambda f: jax.grad(jax.grad(f)), lambda f: jax.jit(jax.hes
 
 @pytest.mark.parametrize("twice", TWICE, ids=["hessian", "gradient of a gradient", "compiled"])
 def test_second_derivatives_are_refused_before_anything_runs(cart, twice, monkeypatch):
-    monkeypatch.setattr(_cpu, "_launcher", lambda *_: pytest.fail("something is launched"))
+    monkeypatch.setattr(_launch, "_launcher", lambda *_: pytest.fail("something is launched"))
     scene, state = cart
 
     def way(friction):

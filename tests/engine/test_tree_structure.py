@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import dano
-from dano.engine.joints import tree_structure
+from dano.engine._joints import tree_structure
 
 BODY, PARENT, KIND, PLACE, WIDTH, FIRST_COLUMN, COLUMNS, ALONE, TREE = 0, 1, 3, 6, 7, 10, 11, 12, 13
 ROOT = 5

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from dano.fields._hash_grid import HashGrid, rows_of
+from dano.fields.readers._nerfacto import HashGrid, rows_of
 
 
 @pytest.mark.parametrize("hashed", [False, True])

@@ -13,7 +13,7 @@ import pytest
 from engine.trees import coordinates
 
 import dano
-from dano.identification._parameters import space_of
+from dano.identification._settings import space_of
 from dano.identification._uncertainty import between_groups, Groups
 from dano.identification._windows import draw_velocities, plan_windows
 from dano.maths import quat_multiply

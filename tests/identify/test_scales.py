@@ -7,8 +7,7 @@ import pytest
 
 import dano
 from dano.identification import Errors
-from dano.identification._identify import _missed
-from dano.identification._scales import check_scales
+from dano.identification._identify import _missed, check_scales
 from dano.identification._uncertainty import _width
 from dano.maths import quat_exp, quat_multiply, quat_rotate
 

@@ -9,7 +9,7 @@ import pytest
 
 import dano
 from benchmarks.identify import _cases
-from dano.identification._planes import plane_through, Smoothing
+from dano.identification._residuals import plane_through, Smoothing
 from dano.identification._settling import _directions
 from dano.maths import quat_exp, quat_from_axis_angle, quat_multiply
 

@@ -14,7 +14,7 @@ import pytest
 import warp as wp
 
 from dano.native import (
-    _declared,
+    _instances,
     _layout,
     _objects,
     Features,
@@ -110,10 +110,10 @@ def test_numbers_that_do_not_fit_an_array():
 
 def test_all_sources_count():
     """A formula that changes makes objects out of date; one of another kernel does not."""
-    behind = _declared.modules_behind("dano.engine.kernels.rollout")
+    behind = _instances.modules_behind("dano.engine.kernels.rollout")
     assert {"dano.physics.point_law", "dano.engine.kernels.solve", "dano.physics.features"} <= set(behind)
     assert not any("derivatives" in name for name in behind)
-    assert "dano.engine.kernels.derivatives.bodies" in _declared.modules_behind(
+    assert "dano.engine.kernels.derivatives.bodies" in _instances.modules_behind(
         "dano.engine.kernels.derivatives.pullback"
     )
     other = FEATURES.but(WIDE=True)
@@ -208,7 +208,7 @@ def test_two_processes_at_once(tmp_path):
 SOURCE = """
 import hashlib, sys
 from dano.native import Features, instance
-from dano.engine.launching._builds import builds
+from dano.engine.launching._tables import builds
 for module in sys.argv[1:]:
     features = builds()[0]
     if "derivatives" in module:

@@ -10,9 +10,7 @@ from jaxtyping import Float
 
 from dano.checks import checked_count, checked_items, checked_kind, checked_optional, checked_progress
 from dano.comparison import _bodies
-from dano.comparison._mujoco import MuJoCo
-from dano.comparison._own import Own
-from dano.comparison._pybullet import has_pybullet, PyBullet
+from dano.comparison._engines import has_pybullet, MuJoCo, Own, PyBullet
 from dano.exchange import convex_hull, enclosed, Moments, signed_distances, solid_triangles, Triangles
 from dano.extras import is_installed
 from dano.fields import AbstractField, AbstractShape, bake, GridField

@@ -143,14 +143,19 @@ def _in_blocks(points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]
 
 
 def _spatial_order(points: np.ndarray) -> np.ndarray:
-    """Permutation that makes each run of `BLOCK` points compact: recursive splits of the longest extent."""
+    """Permutation that makes each run of `BLOCK` points compact: recursive splits of the longest extent.
+
+    The first part of a split has a power of two blocks, so that 4, 16, 64, … blocks from a multiple on are
+    compact, too.
+    """
 
     def split(index: np.ndarray) -> list[np.ndarray]:
         if len(index) <= BLOCK:
             return [index]
         x = points[index]
         axis = int(np.argmax(x.max(axis=0) - x.min(axis=0)))
-        left = BLOCK * ((len(index) // BLOCK + 1) // 2)
+        blocks = -(-len(index) // BLOCK)
+        left = BLOCK << ((blocks - 1).bit_length() - 1)
         part = np.argsort(x[:, axis], kind="stable")
         return split(index[part[:left]]) + split(index[part[left:]])
 

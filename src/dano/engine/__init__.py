@@ -1,8 +1,13 @@
 """Engines: from a scene and a state to the next one, and everything built on that."""
 
-from dano.engine._compiling import compiled as compiled, compiler_options as compiler_options
-from dano.engine._controls import held as held, Policy as Policy
-from dano.engine._finite import marked as marked
+from dano.compiling import compiled as compiled, compiler_options as compiler_options
+from dano.engine._engines import (
+    AbstractEngine as AbstractEngine,
+    checked_engine as checked_engine,
+    marked as marked,
+    runs_on as runs_on,
+    VariationalEngine as VariationalEngine,
+)
 from dano.engine._history import (
     contact_history as contact_history,
     contact_patches as contact_patches,
@@ -10,18 +15,15 @@ from dano.engine._history import (
     ContactHistory as ContactHistory,
     Touch as Touch,
 )
-from dano.engine._reports import Report as Report
 from dano.engine._rollout import (
-    AbstractEngine as AbstractEngine,
-    checked_engine as checked_engine,
     difference as difference,
+    held as held,
     linearize as linearize,
+    Policy as Policy,
     retract as retract,
     simulate as simulate,
     step as step,
-    VariationalEngine as VariationalEngine,
 )
-from dano.engine._runs_on import runs_on as runs_on
 from dano.engine.batches import (
     device_mesh as device_mesh,
     gather as gather,
@@ -32,3 +34,4 @@ from dano.engine.batches import (
     rollouts as rollouts,
     StoredRollouts as StoredRollouts,
 )
+from dano.engine.launching import Report as Report

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dano.compiling import compiled
 from dano.contact import Patch
-from dano.engine._compiling import compiled
-from dano.engine._rollout import AbstractEngine, check_state, checked_engine
+from dano.engine._engines import AbstractEngine, checked_engine
+from dano.engine._rollout import check_state
 from dano.scene import offer, Scene, State, Trajectory
 
 

@@ -1,9 +1,16 @@
-"""The verbs: one step, many steps, a step's linearisation, the forces of a step."""
+"""The verbs: one step, many steps, a step's linearisation; and what drives bodies meanwhile.
 
-import abc
+Nothing of a rollout is compiled anew for another number of steps. What a scene's steps share is one compiled
+program; a rollout without a policy is a launch, which is told the number of steps. A policy is compiled with
+a step, in a program that makes as many of them as it is told. Only inside of `jax.jit`, and for derivatives
+by a policy, a number of steps is part of a program.
+"""
+
 import dataclasses
+import inspect
 import math
 import warnings
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -11,17 +18,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from dano.checks import checked_count, checked_kind, checked_number
-from dano.contact import Patch
-from dano.engine import _touching, _variational
-from dano.engine._compiling import compiled
-from dano.engine._controls import check_control, Policy, spread
-from dano.engine._finite import unsound
-from dano.engine._reports import Report, SolverOptions
-from dano.engine._rolling import rolled
-from dano.maths import by_numpy, is_traced, Q, quat_conjugate, quat_exp, quat_multiply
+from dano.checks import checked_count, checked_kind, checked_number, shown
+from dano.compiling import by_numpy_on_cpus, compiled, is_enclosed
+from dano.engine._engines import AbstractEngine, checked_engine, unsound
+from dano.engine.launching import Report
+from dano.maths import by_numpy, is_traced, library, on_device, Q, quat_conjugate, quat_exp, quat_multiply
 from dano.names import see
 from dano.scene import coming_from, Control, Origin, RESOLVED, Scene, State, Trajectory
 
@@ -29,112 +32,13 @@ from dano.scene import coming_from, Control, Origin, RESOLVED, Scene, State, Tra
 CHECKPOINT_FROM = 2000
 # Gap in a loop with which a state may start [m, rad]; in single precision a hundred times more.
 _OPEN = 1e-6
+# Steps that a program makes at most before it is asked again.
+_ROWS = 256
+# What the steps of scenes share, of those that were simulated last and are still there, by scene and engine.
+_KEPT: dict[tuple[int, Any], tuple["weakref.ref[Scene]", Any]] = {}
+_MOST = 8
 
-
-class AbstractEngine(eqx.Module):
-    """Advances the state of a scene."""
-
-    def prepare(self, scene: Scene) -> Any:
-        """What the steps of a scene share, computed once a rollout; passed to `step`."""
-        return None
-
-    def prepares_by_numpy(self, scene: Scene) -> bool:
-        """Whether `prepare` computes by NumPy, and is called outside of a program."""
-        return False
-
-    @abc.abstractmethod
-    def step(
-        self, scene: Scene, prepared: Any, state: State, control: Control | None
-    ) -> tuple[State, Report]:
-        """One timestep; the report says whether the step's equations were solved."""
-
-    def enlarged(self, scene: Scene, factor: int) -> "AbstractEngine | None":
-        """The engine with `factor` times the contact capacity that it chose; None if it was given."""
-        return None
-
-    def rollout(
-        self, scene: Scene, prepared: Any, state: State, controls: Control | None, n_steps: int
-    ) -> tuple[State, Report] | None:
-        """Many timesteps at once; arrays with a leading axis of steps. None: `step` makes each of them."""
-        return None
-
-    def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
-        """Overlap of every pair that may touch at a state, arrays in the order of `scene.pairs`.
-
-        Raises:
-            ValueError: If the engine does not say.
-        """
-        raise ValueError(f"engine must say where bodies touch, got {type(self).__name__}, which does not")
-
-    def wrenches(
-        self, scene: Scene, prepared: Any, before: State, after: State, about: Float[Array, "contacts 3"]
-    ) -> Float[Array, "contacts 6"]:
-        """Force [N] and torque about points [N m] on the first body of every pair [W] during a step.
-
-        Raises:
-            ValueError: If the engine does not say.
-        """
-        raise ValueError(f"engine must say contact forces, got {type(self).__name__}, which does not")
-
-
-class VariationalEngine(AbstractEngine):
-    """The variational integrator with an implicit solve per step (see `dano.engine._variational`)."""
-
-    # A step is solved when no component of its residual, divided by mass or inertia, exceeds this times (1 +
-    # its largest velocity) [m/s, rad/s]; default: the dtype's resolution to the power 3/4 (2e-12, 6e-6).
-    tolerance: float | None = eqx.field(static=True, default=None)
-    # Newton and line search passes after which a step is reported as not converged.
-    max_iterations: int = eqx.field(static=True, default=500)
-    # Chunks of 16 point contacts that a step has room for. A step with more is reported as not converged.
-    # Default: by the bodies; and where `dano.step` and `dano.simulate` find more, they compile and run again
-    # with room for all (outside of `jax.jit`).
-    capacity: int | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self):
-        """Raise a ValueError unless both options are positive."""
-        if self.tolerance is not None:
-            checked_number("tolerance", self.tolerance, above=0)
-        checked_count("max_iterations", self.max_iterations)
-        if self.capacity is not None:
-            checked_count("capacity", self.capacity)
-
-    def prepare(self, scene: Scene) -> _variational.Prepared:
-        """See `AbstractEngine.prepare`."""
-        return _variational.prepare(scene, self.capacity)
-
-    def prepares_by_numpy(self, scene: Scene) -> bool:
-        """See `AbstractEngine.prepares_by_numpy`."""
-        return _variational.is_by_numpy(scene)
-
-    def enlarged(self, scene: Scene, factor: int) -> "VariationalEngine | None":
-        """See `AbstractEngine.enlarged`."""
-        if self.capacity is not None or scene.room is None:
-            return None
-        return VariationalEngine(self.tolerance, self.max_iterations, factor * scene.room)
-
-    def step(
-        self, scene: Scene, prepared: Any, state: State, control: Control | None
-    ) -> tuple[State, Report]:
-        """See `AbstractEngine.step`."""
-        options = SolverOptions(self.tolerance, self.max_iterations)
-        return _variational.step(scene, prepared, state, control, options)
-
-    def rollout(
-        self, scene: Scene, prepared: Any, state: State, controls: Control | None, n_steps: int
-    ) -> tuple[State, Report] | None:
-        """See `AbstractEngine.rollout`."""
-        options = SolverOptions(self.tolerance, self.max_iterations)
-        return _variational.rollout(scene, prepared, state, controls, n_steps, options)
-
-    def touch(self, scene: Scene, prepared: Any, state: State) -> Patch:
-        """See `AbstractEngine.touch`."""
-        return _touching.touch(scene, prepared.tables, prepared.capacity, state)
-
-    def wrenches(
-        self, scene: Scene, prepared: Any, before: State, after: State, about: Float[Array, "contacts 3"]
-    ) -> Float[Array, "contacts 6"]:
-        """See `AbstractEngine.wrenches`."""
-        return _touching.wrenches(scene, prepared.tables, prepared.capacity, before, after, about)
+Policy = Callable[[State, Float[Array, ""]], Control]
 
 
 def _check_one(scene: Scene, state: State) -> None:
@@ -169,15 +73,6 @@ def check_state(scene: Scene, state: State) -> None:
                 f"state must close the loops of the scene, got a gap of {gap:.3g} m or rad:"
                 " dano.close_loops(scene, state) closes them"
             )
-
-
-def checked_engine(engine: AbstractEngine | None) -> AbstractEngine:
-    """An engine; None stands for `VariationalEngine()`.
-
-    Raises:
-        ValueError: If it is not an engine.
-    """
-    return VariationalEngine() if engine is None else checked_kind("engine", engine, AbstractEngine)
 
 
 def step(
@@ -448,3 +343,272 @@ def _say(scene: Scene, following: State, report: Report) -> None:
             RuntimeWarning,
             stacklevel=3,
         )
+
+
+def rolled(
+    engine: Any, scene: Scene, state: State, controls: Any, n_steps: int, segment: int | None
+) -> tuple[State, Report]:
+    """States from the first to the last, and reports of the steps between.
+
+    Args:
+        engine: The engine.
+        scene: The scene.
+        state: At the start.
+        controls: Of each step, a policy, or None.
+        n_steps: Number of steps.
+        segment: Of how many steps reverse mode keeps the first state only; None: all are kept.
+    """
+    state = _of_jax(state)
+    if isinstance(controls, Control):
+        controls = _of_jax(controls)
+    prepared, state = _prepared(engine, scene), _filled(scene, state)
+    if not callable(controls):
+        found = engine.rollout(scene, prepared, state, controls, n_steps)
+        if found is not None:
+            return with_start(state, found[0]), found[1]
+    elif not is_enclosed() and not is_traced(scene, state):
+        return _in_turn(engine, scene, prepared, state, controls, n_steps)
+    return _jitted_scan(engine, scene, prepared, state, controls, n_steps, segment)
+
+
+def _of_jax(tree: Any) -> Any:
+    """A tree with JAX's arrays in place of NumPy's."""
+    return jax.tree.map(lambda x: on_device(x) if isinstance(x, np.ndarray) else x, tree)
+
+
+def _prepared(engine: Any, scene: Scene) -> Any:
+    if not engine.prepares_by_numpy(scene):
+        return _jitted_prepared(engine, scene)
+    key = id(scene), engine
+    found = _KEPT.get(key)
+    if found is not None and found[0]() is scene:
+        return found[1]
+    # Also where a program around it is traced: what is kept belongs to no trace.
+    with jax.ensure_compile_time_eval():
+        prepared = engine.prepare(scene)
+    while len(_KEPT) >= _MOST:
+        _KEPT.pop(next(iter(_KEPT)), None)
+    _KEPT[key] = weakref.ref(scene, lambda _: _KEPT.pop(key, None)), prepared
+    return prepared
+
+
+@compiled
+def _jitted_prepared(engine: Any, scene: Scene) -> Any:
+    return engine.prepare(scene)
+
+
+def _filled(scene: Scene, state: State) -> State:
+    if not scene.joints or not is_traced(scene, state):
+        return scene.filled(state)
+    return _jitted_filled(scene, state)
+
+
+@compiled
+def _jitted_filled(scene: Scene, state: State) -> State:
+    return scene.filled(state)
+
+
+@by_numpy_on_cpus
+def with_start(state: State, states: State) -> State:
+    """States with the one that they begin with."""
+    return jax.tree.map(lambda x, rest: library(x, rest).concatenate([x[None], rest]), state, states)
+
+
+def _in_turn(engine: Any, scene: Scene, prepared: Any, state: State, policy: Any, n_steps: int):
+    """A rollout under a policy, some rows after the other."""
+    parts, now = [], state
+    for first in range(0, n_steps, _ROWS):
+        count = min(_ROWS, n_steps - first)
+        now, rows = _jitted_rows(engine, scene, prepared, now, policy, np.int32(first), np.int32(count))
+        parts.append(rows if count == _ROWS else _cut(rows, count))
+    states, report = _joined(parts)
+    return with_start(state, states), report
+
+
+@compiled
+def _jitted_rows(
+    engine: Any,
+    scene: Scene,
+    prepared: Any,
+    state: State,
+    policy: Any,
+    first: Int[Array, ""],
+    count: Int[Array, ""],
+) -> tuple[State, tuple[State, Report]]:
+    """The state after some steps, and rows of states and reports, of which as many are filled."""
+
+    def advance(index: Array, state: State) -> tuple[State, Report]:
+        time = scene.timestep * (first + index).astype(scene.timestep.dtype)
+        return engine.step(scene, prepared, state, asked(policy, scene, state, time))
+
+    def add(index: Array, carry: Any) -> Any:
+        state, rows = carry
+        found = advance(index, state)
+        return found[0], jax.tree.map(lambda all, one: all.at[index].set(one), rows, found)
+
+    shapes = eqx.filter_eval_shape(advance, jnp.int32(0), state)
+    rows = jax.tree.map(lambda x: jnp.zeros((_ROWS, *x.shape), x.dtype), shapes)
+    return jax.lax.fori_loop(jnp.int32(0), count, add, (state, rows))
+
+
+@by_numpy_on_cpus
+def _joined(parts: list[Any]) -> Any:
+    return jax.tree.map(lambda *x: library(*x).concatenate(x), *parts)
+
+
+@by_numpy_on_cpus
+def _cut(rows: Any, count: int) -> Any:
+    return jax.tree.map(lambda x: x[:count], rows)
+
+
+@compiled
+def _jitted_scan(
+    engine: Any,
+    scene: Scene,
+    prepared: Any,
+    state: State,
+    controls: Control | Policy | None,
+    n_steps: int,
+    segment: int | None,
+) -> tuple[State, Report]:
+    given = controls if isinstance(controls, Control) else None
+    policy = None if controls is None or isinstance(controls, Control) else controls
+
+    def advance(state: State, inputs: Any) -> Any:
+        index, control = inputs
+        if policy is not None:
+            control = asked(policy, scene, state, scene.timestep * index)
+        following, report = engine.step(scene, prepared, state, control)
+        return following, (following, report)
+
+    def scan(state: State, inputs: Any) -> Any:
+        return jax.lax.scan(advance, state, inputs)
+
+    steps = jnp.arange(n_steps, dtype=scene.timestep.dtype), given
+    if segment is None or segment >= n_steps:
+        _, (states, report) = scan(state, steps)
+    else:
+        whole = n_steps - n_steps % segment
+        head = jax.tree.map(lambda x: x[:whole].reshape(-1, segment, *x.shape[1:]), steps)
+        last, (states, report) = jax.lax.scan(jax.checkpoint(scan), state, head)
+        states, report = jax.tree.map(lambda x: x.reshape(whole, *x.shape[2:]), (states, report))
+        if whole < n_steps:
+            _, tail = scan(last, jax.tree.map(lambda x: x[whole:], steps))
+            states, report = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), (states, report), tail)
+    return with_start(state, states), report
+
+
+class Held(eqx.Module):
+    """A policy that answers with one control at all times."""
+
+    control: Control
+
+    def __call__(self, state: State, time: Float[Array, ""]) -> Control:
+        """The control."""
+        return self.control
+
+
+def held(controls: Any) -> Any:
+    """Controls of which one step is given, as a policy; others as they are."""
+    return Held(controls) if isinstance(controls, Control) and controls.force.ndim == 2 else controls
+
+
+def check_control(scene: Scene, control: Control | None, leading: tuple[int, ...]) -> None:
+    """Check a control against a scene.
+
+    Args:
+        scene: The scene.
+        control: Of one step, or of many.
+        leading: Axes before those of bodies and joints.
+
+    Raises:
+        ValueError: If a shape is wrong, a force is not finite, or commands are given to no motor.
+    """
+    if control is None:
+        return
+    checked_kind("control", control, Control)
+    expected = (*leading, len(scene.bodies), 3)
+    for name in ("force", "torque"):
+        value = getattr(control, name)
+        if value.shape != expected:
+            raise ValueError(f"control.{name} must have shape {expected}, got {value.shape}")
+        if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
+            raise ValueError(f"control.{name} must be finite")
+    expected = (*leading, scene.layout.n_joints)
+    for name in ("effort", "command"):
+        value = getattr(control, name)
+        if value is not None and value.shape != expected:
+            raise ValueError(f"control.{name} must have shape {expected}, got {value.shape}")
+    if control.command is not None and not scene.driven:
+        raise ValueError("control.command must be None in a scene whose joints have no motor")
+
+
+def spread(
+    scene: Scene, controls: Control | Policy | None, n_steps: int | None
+) -> tuple[Control | Policy | None, int]:
+    """Controls of all steps, and how many there are; those of one step act in all of them.
+
+    Raises:
+        ValueError: If controls do not fit the scene or the number of steps, or that is missing or < 1.
+    """
+    if controls is None or callable(controls):
+        if controls is not None:
+            _check_arguments(controls)
+        return controls, checked_count("n_steps", n_steps)
+    checked_kind("controls", controls, Control)
+    if controls.force.ndim == 2:
+        check_control(scene, controls, ())
+        count = checked_count("n_steps", n_steps)
+        return _repeated(controls, count), count
+    rows = int(controls.force.shape[0]) if controls.force.ndim == 3 else -1
+    count = rows if n_steps is None else n_steps
+    check_control(scene, controls, (count,))
+    return controls, checked_count("n_steps", count)
+
+
+@by_numpy_on_cpus
+def _repeated(control: Control, count: int) -> Control:
+    return jax.tree.map(lambda x: library(x).broadcast_to(x, (count, *x.shape)), control)
+
+
+def asked(controls: Any, scene: Scene, state: State, time: Float[Array, ""]) -> Control:
+    """What a policy answers, while a rollout is traced.
+
+    Raises:
+        ValueError: If it branches on numbers that are not known yet, or returns no control of the scene.
+    """
+    try:
+        control: Any = controls(state, time)
+    except jax.errors.ConcretizationTypeError as error:
+        raise ValueError(
+            "controls(state, time) is compiled, so it cannot branch on numbers of the state or the time:"
+            " write jnp.where(time < 0.5, a, b) in place of `if`, and jnp in place of np"
+        ) from error
+    if not isinstance(control, Control):
+        raise ValueError(
+            "controls(state, time) must return a dano.Control, as scene.control(ball=dict(force=…)) or"
+            f" dano.joint_control(scene, efforts) make it, got {shown(control)}"
+        )
+    try:
+        check_control(scene, control, ())
+    except ValueError as error:
+        raise ValueError(f"controls(state, time) must return the control of a step: {error}") from error
+    return control
+
+
+def _check_arguments(controls: Policy) -> None:
+    """Check that a policy can be called with a state and a time.
+
+    Raises:
+        ValueError: If it cannot.
+    """
+    try:
+        signature = inspect.signature(controls)
+    except (TypeError, ValueError):
+        return  # of what is written in C nothing is known
+    try:
+        signature.bind(None, None)
+    except TypeError as error:
+        raise ValueError(
+            f"controls must be a function of (state, time), got one of {signature}: {error}"
+        ) from error

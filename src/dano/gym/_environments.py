@@ -206,6 +206,7 @@ class SceneVectorEnv(gymnasium.vector.VectorEnv):
         self._roomy = _Roomy(rules, Rules.many)
         self.states = _repeated(self._first, n_envs)
         self._steps, self._ended = np.zeros(n_envs, int), np.zeros(n_envs, bool)
+        self._alone = jax.local_device_count() == 1
         self.single_observation_space, self.single_action_space = _spaces(rules)
         self.observation_space = batch_space(self.single_observation_space, n_envs)
         self.action_space = batch_space(self.single_action_space, n_envs)
@@ -230,7 +231,7 @@ class SceneVectorEnv(gymnasium.vector.VectorEnv):
         begins = self._ended
         self._begin(begins)
         self._steps = np.where(begins, 0, self._steps)
-        made = self._together if jax.local_device_count() == 1 else self._spread
+        made = self._together if self._alone else self._spread
         seen, rewards, met, lengths, solved = made(actions, begins)
         self._steps = np.where(begins, 0, self._steps + 1)
         over = (self._steps >= self.rules.n_steps) | ~solved

@@ -1,8 +1,11 @@
 """Identification: from observed motions to the parameters of a scene, with error bars."""
 
 from dano.identification._identify import identify as identify
-from dano.identification._parameters import Parameter as Parameter, parameter_of as parameter_of
-from dano.identification._settings import IdentifyOptions as IdentifyOptions
+from dano.identification._settings import (
+    IdentifyOptions as IdentifyOptions,
+    Parameter as Parameter,
+    parameter_of as parameter_of,
+)
 from dano.identification._uncertainty import (
     Errors as Errors,
     Identification as Identification,

@@ -15,7 +15,6 @@ from jaxtyping import Array
 
 from dano.engine import device_mesh
 from dano.identification._checkpoint import Keep, SearchCheckpoint
-from dano.identification._planes import Smoothing
 from dano.identification._residuals import (
     Linearized,
     linearized,
@@ -23,6 +22,7 @@ from dano.identification._residuals import (
     moved,
     ResidualModel,
     shifted,
+    Smoothing,
     WindowStart,
 )
 from dano.identification._settings import Setup, start_deviations

@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dano.gradients import Check, check
-from dano.identification._planes import Smoothing
-from dano.identification._residuals import Linearized
+from dano.identification._residuals import Linearized, Smoothing
 from dano.solvers import eliminated, gauss_newton, NormalEquations, Solution, Stop
 
 # Widest draws of a parameter: a share of its range, or of its value without bounds.

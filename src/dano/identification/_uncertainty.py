@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from dano.gradients import Check
-from dano.identification._parameters import Selection, Space, with_values
+from dano.identification._settings import Selection, Space, with_values
 from dano.identification.motions import Motion
 from dano.notebook import card, curves, numbers, plain
 from dano.scene import Scene, State, state_arrays

@@ -15,11 +15,19 @@ import numpy as np
 
 from dano.checks import checked_count
 from dano.maths import Numbers
-from dano.mujoco._direct import Direct, direct
-from dano.mujoco._model import carry, carry_compiled, concerns, library, names_of, without_callback
-from dano.mujoco._settings import is_gap_beyond, Writer
+from dano.mujoco._direct import Direct, direct, Writer
 from dano.mujoco._table import body_index, BridgeTable, Chooser, MOST
-from dano.mujoco._things import AttachedObject, checked_thing
+from dano.mujoco._things import (
+    AttachedObject,
+    carry,
+    carry_compiled,
+    checked_thing,
+    concerns,
+    is_gap_beyond,
+    library,
+    names_of,
+    without_callback,
+)
 from dano.mujoco._worlds import warp_device, warp_library
 from dano.names import did_you_mean
 from dano.objects import NeuralObject

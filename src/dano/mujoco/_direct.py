@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Int
 
 from dano.mujoco._search import CALLBACK, CALLBACK_FEATURES, NearSearch
-from dano.mujoco._settings import Writer
-from dano.mujoco.kernels.words import Entry, Head, SHIFT
+from dano.mujoco.kernels.words import Entry, Head, REALS, SHIFT, WHOLES
 from dano.native import cpu_kernel, KernelLaunch, Parameters
 
 _PAGE = 4096
@@ -25,6 +24,39 @@ _FARTHEST = 1 << 20
 """Bytes within which a number must stand: an `mjData` has some 200,000."""
 _LEAST = 64
 """Slots of the smallest table."""
+
+
+class Writer:
+    """Adds contacts to an `mjData`, by one `mjContact` whose memory is written over and over."""
+
+    def __init__(self, mujoco: Any):
+        """Make it.
+
+        Raises:
+            RuntimeError: If this version of MuJoCo has another `mjContact`.
+        """
+        self._add = mujoco.mj_addContact
+        self._contact = contact = mujoco.MjContact()
+        begin, whole = contact.pos.ctypes.data - 8, contact.geom.ctypes.data - 12
+        self._reals = np.ctypeslib.as_array((ctypes.c_double * REALS).from_address(begin))
+        self._wholes = np.ctypeslib.as_array((ctypes.c_int32 * WHOLES).from_address(whole))
+        self._reals[:], self._wholes[:] = np.arange(REALS) + 0.5, np.arange(WHOLES) + 40
+        read = [contact.dist, *contact.pos, *contact.frame, contact.includemargin, *contact.friction]
+        read += [*contact.solref, *contact.solreffriction, *contact.solimp]
+        counted = [contact.dim, contact.geom1, contact.geom2, *contact.geom, *contact.flex, *contact.elem]
+        counted += [*contact.vert, contact.exclude, contact.efc_address]
+        if not np.array_equal(read, self._reals) or not np.array_equal(counted, self._wholes):
+            raise RuntimeError(f"mjContact of MuJoCo {mujoco.__version__} is not laid out as dano knows it")
+
+    def places(self) -> tuple[int, int]:
+        """Addresses of its real and its whole numbers; they are there as long as this is."""
+        return self._reals.ctypes.data, self._wholes.ctypes.data
+
+    def add(self, model: Any, data: Any, reals, wholes) -> bool:
+        """Add one by the numbers of `dano.mujoco.kernels.tables`; False: full."""
+        self._reals[:] = reals
+        self._wholes[:] = wholes
+        return self._add(model, data, self._contact) == 0
 
 
 def _place(begin: int, number: Any) -> int:

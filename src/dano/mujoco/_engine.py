@@ -19,8 +19,8 @@ from dano.checks import checked_choice, checked_kind, checked_number
 from dano.contact import Patch
 from dano.engine import AbstractEngine, marked, Report, VariationalEngine
 from dano.maths import AnyArray
-from dano.mujoco._model import library
 from dano.mujoco._spec import TOUCHES
+from dano.mujoco._things import library
 from dano.mujoco._twin import Constants, Motion, Twin
 from dano.names import did_you_mean
 from dano.scene import Control, lifted, Scene, State

@@ -8,9 +8,8 @@ import numpy as np
 
 from dano.checks import checked_count
 from dano.maths import Numbers
-from dano.mujoco._model import library
 from dano.mujoco._table import body_index, BridgeTable, MOST
-from dano.mujoco._things import AttachedObject, checked_thing
+from dano.mujoco._things import AttachedObject, checked_thing, library
 from dano.mujoco._worlds import Worlds
 from dano.names import did_you_mean
 from dano.objects import NeuralObject

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dano.mujoco._settings import ContactSettings, is_gap_beyond
-from dano.mujoco._things import AttachedObject, Geom, object_solid, Solid, Surface
+from dano.mujoco._settings import ContactSettings
+from dano.mujoco._things import AttachedObject, Geom, is_gap_beyond, object_solid, Solid, Surface
 from dano.mujoco.kernels import words
 from dano.mujoco.kernels.words import REALS, WHOLES
 from dano.native import (

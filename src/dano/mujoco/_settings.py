@@ -5,15 +5,11 @@ the masses: a damped oscillator that may push but not pull. It lets go when its 
 before it is stretched back.
 """
 
-import ctypes
-import functools
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-
-from dano.mujoco.kernels.words import REALS, WHOLES
 
 LEAST_FRICTION = 1e-5
 """MuJoCo's mjMINMU."""
@@ -52,53 +48,6 @@ def overriding(model: Any) -> ContactSettings:
     """The model's global contact parameters; of its directions and gap nothing is said."""
     option = model.opt
     return ContactSettings(0, option.o_friction, option.o_solref, option.o_solimp, float(option.o_margin))
-
-
-@functools.cache
-def is_gap_beyond(mujoco: Any) -> bool:
-    """Whether contacts are listed from margin plus gap on, as newer versions of MuJoCo have it.
-
-    In others they are listed from the margin on, and press a gap later. Not to be asked in a callback.
-    """
-    geom = '<geom size="0.1" margin="0.01" gap="0.004"/>'
-    body = f'<body pos="0 0 0.1"><freejoint/>{geom}</body>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geom}{body}</worldbody></mujoco>")
-    data = mujoco.MjData(model)
-    mujoco.mj_fwdPosition(model, data)
-    return bool(data.contact[0].includemargin > 0.018)
-
-
-class Writer:
-    """Adds contacts to an `mjData`, by one `mjContact` whose memory is written over and over."""
-
-    def __init__(self, mujoco: Any):
-        """Make it.
-
-        Raises:
-            RuntimeError: If this version of MuJoCo has another `mjContact`.
-        """
-        self._add = mujoco.mj_addContact
-        self._contact = contact = mujoco.MjContact()
-        begin, whole = contact.pos.ctypes.data - 8, contact.geom.ctypes.data - 12
-        self._reals = np.ctypeslib.as_array((ctypes.c_double * REALS).from_address(begin))
-        self._wholes = np.ctypeslib.as_array((ctypes.c_int32 * WHOLES).from_address(whole))
-        self._reals[:], self._wholes[:] = np.arange(REALS) + 0.5, np.arange(WHOLES) + 40
-        read = [contact.dist, *contact.pos, *contact.frame, contact.includemargin, *contact.friction]
-        read += [*contact.solref, *contact.solreffriction, *contact.solimp]
-        counted = [contact.dim, contact.geom1, contact.geom2, *contact.geom, *contact.flex, *contact.elem]
-        counted += [*contact.vert, contact.exclude, contact.efc_address]
-        if not np.array_equal(read, self._reals) or not np.array_equal(counted, self._wholes):
-            raise RuntimeError(f"mjContact of MuJoCo {mujoco.__version__} is not laid out as dano knows it")
-
-    def places(self) -> tuple[int, int]:
-        """Addresses of its real and its whole numbers; they are there as long as this is."""
-        return self._reals.ctypes.data, self._wholes.ctypes.data
-
-    def add(self, model: Any, data: Any, reals, wholes) -> bool:
-        """Add one by the numbers of `dano.mujoco.kernels.tables`; False: full."""
-        self._reals[:] = reals
-        self._wholes[:] = wholes
-        return self._add(model, data, self._contact) == 0
 
 
 def rebound(ratio: float) -> float:

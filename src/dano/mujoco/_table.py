@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
-from dano.mujoco._model import standin_name
 from dano.mujoco._search import BridgeModel, NearSearch, Part, part_of_geom, part_of_thing
 from dano.mujoco._settings import ContactSettings, overriding
-from dano.mujoco._things import AttachedObject, geom_of
+from dano.mujoco._things import AttachedObject, geom_of, standin_name
 from dano.mujoco._worlds import Worlds
 
 MOST = 8

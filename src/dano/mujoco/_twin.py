@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 
 from dano.maths import quat_exp, quat_log
 from dano.mujoco._bridge import Bridge
-from dano.mujoco._model import library
 from dano.mujoco._settings import ContactSettings, LEAST_FRICTION, spring_of
 from dano.mujoco._spec import add_mesh, AS_SAMPLES, joint_names, motor_name, spec_of, weigh_later
+from dano.mujoco._things import library
 from dano.scene import Scene
 
 _ENDLESS = 1e9

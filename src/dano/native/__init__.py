@@ -1,13 +1,10 @@
 """Kernels compiled for this machine, and solids as they read them."""
 
-from dano.native._cores import n_cores as n_cores, together as together
-from dano.native._cubins import (
-    ARCHITECTURES as ARCHITECTURES,
-    kernel_in_lanes as kernel_in_lanes,
-    make_cubin as make_cubin,
+from dano.native._instances import (
+    Features as Features,
+    fields_of as fields_of,
+    instance as instance,
 )
-from dano.native._declared import fields_of as fields_of
-from dano.native._instances import Features as Features, instance as instance
 from dano.native._layout import (
     Array as Array,
     Layout as Layout,
@@ -30,12 +27,17 @@ from dano.native._leaves import (
     slabs_of_blocks as slabs_of_blocks,
 )
 from dano.native._objects import (
+    ARCHITECTURES as ARCHITECTURES,
     cpu_kernel as cpu_kernel,
     Kernel as Kernel,
+    kernel_in_lanes as kernel_in_lanes,
     KernelLaunch as KernelLaunch,
     LEVELS as LEVELS,
+    make_cubin as make_cubin,
     make_object as make_object,
+    n_cores as n_cores,
     shipped_path as shipped_path,
+    together as together,
     what_is_shipped as what_is_shipped,
 )
 from dano.native._warp import begin as begin, compiled_kernel as compiled_kernel, FLAGS as FLAGS

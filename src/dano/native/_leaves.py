@@ -31,8 +31,8 @@ from dano.physics.solids import kinds as numbers_of_kinds
 
 LEAF_WIDTH = 20
 """Numbers of a leaf."""
-# Blocks of a run: see `dano.engine.kernels.tables`.
-_RUN = 4
+# Blocks of a run, and sizes of runs: see `dano.engine.kernels.tables`.
+_RUN, _LEVELS = 4, 3
 _KIND_WIDTH = 7
 Known = AbstractPrimitive | SignedDistanceGrid | GridField
 """Fields that kernels know."""
@@ -93,7 +93,7 @@ class Leaves(NamedTuple):
     rows: Float[AnyArray, "leaves 20"]  # See `dano.physics.solids.distances.Leaf`
     kinds: Int[np.ndarray, "leaves 7"]  # See `dano.physics.solids.distances.LeafKind`
     coefficients: Float[AnyArray, "coefficients 1"]  # Spline coefficients of all grids, one below the other
-    bounds: Float[AnyArray, "bounds 1"]  # Lower bounds on splines, see `lower_bounds`, one below the other
+    bounds: Float[AnyArray, "bounds 1"]  # Of all grids: `lower_bounds`, then `bends`, one below the other
 
 
 def is_known(field: AbstractField) -> bool:
@@ -165,8 +165,9 @@ def leaf_tables(leaves: Sequence[PlacedField], dtype: DTypeLike) -> Leaves:
             coefficients.append(grid.ravel().astype(dtype))
             at += int(np.prod(grid.shape))
             if isinstance(leaf.field, SignedDistanceGrid):
-                bounds.append(lower_bounds(grid, degree).ravel().astype(dtype))
-                first_bound += bounds[-1].shape[0]
+                for each in (lower_bounds(grid, degree), bends(grid, degree)):
+                    bounds.append(each.ravel().astype(dtype))
+                    first_bound += bounds[-1].shape[0]
         kinds.append(kind)
     return Leaves(
         library(*columns).concatenate([x.reshape(len(leaves), -1) for x in columns], axis=1),
@@ -189,35 +190,92 @@ def lower_bounds(coefficients: Float[AnyArray, "x y z"], degree: int) -> Float[A
         coefficients: Of the spline, its border of `degree` + 1 nodes included.
         degree: Of the spline.
     """
+    return -_most_of_cells(-_constant(coefficients), degree)
+
+
+# How far a spline of degree 1 to 3 is off the straight line between its coefficients, as a share of their
+# largest second difference: the weights of what lies beyond the line's ends add up to no more.
+_OFF = (0.0, 1 / 8, 1 / 6)
+# Rounding of splines, in units of the last place of the largest coefficient.
+_ROUNDING = 1000
+
+
+def bends(coefficients: Float[AnyArray, "x y z"], degree: int) -> Float[AnyArray, "a b c"]:
+    """How far a spline is off the straight one between its coefficients at most, for each block of cells.
+
+    Along an axis a spline S is off the straight line L between the two coefficients next to a place by second
+    differences with weights that add up to at most ⅛ for degree 2, ⅙ for degree 3; and S S S − L L L =
+    (S − L) S S + L (S − L) S + L L (S − L), where S and L are means.
+
+    Args:
+        coefficients: Of the spline, its border of `degree` + 1 nodes included.
+        degree: Of the spline.
+    """
     xp = library(coefficients)
-    bound = coefficients if xp is np else jax.lax.stop_gradient(coefficients)
+    c = _constant(coefficients)
+    bend = None
+    for axis, size in enumerate(c.shape):
+        # At the ends, where nothing is asked, that of the node beside.
+        at = np.clip(np.arange(size), 1, size - 2)
+        bent = xp.abs(xp.take(c, at - 1, axis) - 2 * xp.take(c, at, axis) + xp.take(c, at + 1, axis))
+        bend = bent if bend is None else xp.maximum(bend, bent)
+    off = 3 * _OFF[degree - 1] * _most_of_cells(bend, degree)
+    return off + _ROUNDING * np.finfo(c.dtype).eps * xp.max(xp.abs(c))
+
+
+def _constant(coefficients: AnyArray) -> AnyArray:
+    """Without derivatives."""
+    return coefficients if library(coefficients) is np else jax.lax.stop_gradient(coefficients)
+
+
+def _most_of_cells(x: AnyArray, degree: int) -> AnyArray:
+    """For each block of cells the largest of the nodes that places in it have to do with."""
+    xp = library(x)
     cell = numbers_of_kinds.CELL
-    for axis, size in enumerate(coefficients.shape):
+    for axis, size in enumerate(x.shape):
         n = (size - 2 * degree - 3) // cell + 1
         # From one before the own node of a block's first cell to two beyond that of its last.
         nodes = np.minimum(degree + np.arange(cell + 3)[:, None] + cell * np.arange(n), size - 1)
-        bound = functools.reduce(xp.minimum, (xp.take(bound, each, axis) for each in nodes))
-    return bound
+        x = functools.reduce(xp.maximum, (xp.take(x, each, axis) for each in nodes))
+    return x
 
 
 def _whole(kinds: Sequence[tuple[int, ...]]) -> Int[np.ndarray, "leaves 7"]:
     return np.array(kinds, np.int32).reshape(-1, _KIND_WIDTH)
 
 
-def balls_around_runs(balls: Float[AnyArray, "b 4"]) -> Float[AnyArray, "b 4"]:
-    """Balls around each block and those after it; a run may include blocks of the next body.
+def balls_around_runs(balls: Float[AnyArray, "b 4"], blocks: Sequence[int]) -> Float[AnyArray, "b 4"]:
+    """Balls around 4, 16 and 64 blocks of a body: see `dano.engine.kernels.tables.Scene`.
 
     Args:
         balls: Centre [m] and radius [m] of a ball around each block.
+        blocks: How many each body has, one after the other.
     """
-    n = balls.shape[0]
-    if n == 0:
+    if balls.shape[0] == 0:
         return balls
-    members = np.minimum(np.arange(n)[:, None] + np.arange(_RUN)[None], n - 1)
-    centers, radii = balls[members, :3], balls[members, 3]
     xp = library(balls)
-    middle = _summed(centers, 1) / _RUN
-    reach = xp.sqrt(_summed((centers - middle[:, None]) ** 2, 2)) + radii
+    row = np.zeros(len(balls), np.int32)
+    runs: list[AnyArray] = []
+    at = 0
+    for level in range(_LEVELS):
+        size = _RUN ** (level + 1)
+        members = []
+        for first, n in zip(np.cumsum([0, *blocks]), blocks, strict=False):
+            begins = np.arange(0, n - _RUN**level + 1, size)
+            row[first + begins + level] = at + len(members) + np.arange(len(begins))
+            members += [first + np.minimum(k + np.arange(size), n - 1) for k in begins]
+        if members:
+            runs.append(_ball_around(balls[np.stack(members)]))
+            at += len(members)
+    return xp.concatenate(runs)[row] if runs else balls
+
+
+def _ball_around(balls: Float[AnyArray, "b k 4"]) -> Float[AnyArray, "b 4"]:
+    """A ball around balls."""
+    xp = library(balls)
+    centers, radii = balls[..., :3], balls[..., 3:]
+    middle = 0.5 * (xp.min(centers - radii, axis=1) + xp.max(centers + radii, axis=1))
+    reach = xp.sqrt(_summed((centers - middle[:, None]) ** 2, 2)) + radii[..., 0]
     return xp.concatenate([middle, xp.max(reach, axis=1, keepdims=True)], axis=1)
 
 

@@ -1,10 +1,12 @@
-"""Compiled kernels of a CPU: those that come with dano, those kept on this machine, or new ones.
+"""Compiled kernels: those that come with dano, those kept on this machine, or new ones.
 
-An object of a module lies beside the layouts of its kernels. It is loaded by the library of Warp's compiler,
-which needs neither Warp's Python code, which takes a second to import, nor the modules of kernels, which take
-another to run. Both are asked for only where an object has to be made.
+For CPUs an object of a module lies beside the layouts of its kernels. It is loaded by the library of Warp's
+compiler, which needs neither Warp's Python code, which takes a second to import, nor the modules of kernels,
+which take another to run. Both are asked for only where an object has to be made. For NVIDIA's GPUs machine
+code comes with dano, made on machines without one.
 """
 
+import concurrent.futures
 import ctypes
 import functools
 import hashlib
@@ -16,15 +18,14 @@ import platform
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from dano.caches import cache_folder, cache_place
-from dano.native._declared import modules_behind, source_of
-from dano.native._instances import Features, instance
+from dano.native._instances import Features, instance, modules_behind, source_of
 from dano.native._layout import ArrayField, Layout, layout_of, NumberField, Parameters
-from dano.native._warp import compile_object, FLAGS
+from dano.native._warp import begin, compile_object, compiled_kernel, FLAGS
 
 SHIPPED = Path(__file__).parents[1] / "compiled"
 """Folder of the objects that come with dano, a folder for each level of processors."""
@@ -73,6 +74,25 @@ class KernelLaunch:
     def __call__(self) -> None:
         """Launch."""
         self._call(*self._given)
+
+
+@functools.cache
+def n_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def together(works: Sequence[Callable[[], object]]) -> None:
+    """Do some works that leave Python's lock, the first of them in this thread; returns when all are done."""
+    others = [_workers().submit(work) for work in works[1:]]
+    works[0]()
+    for other in others:
+        other.result()
+
+
+@functools.cache
+def _workers() -> concurrent.futures.ThreadPoolExecutor:
+    return concurrent.futures.ThreadPoolExecutor(max(1, n_cores() - 1), thread_name_prefix="dano")
 
 
 # One thread makes objects at a time: Warp's code and Python's parser are for one.
@@ -290,3 +310,86 @@ def levels() -> list[str]:
         if needed <= has:
             found.insert(0, level)
     return found
+
+
+ARCHITECTURES = (80, 90, 100, 120)
+"""Architectures for which machine code is made (compute capability times ten). It runs on those of the same
+generation that came later, too."""
+
+
+def make_cubin(features: Features, module: str, architecture: int) -> Path:
+    """Compile a module for a GPU; what is there already and fits stays.
+
+    Args:
+        features: What it must know, with its lanes.
+        module: Its name.
+        architecture: Of the GPU.
+    """
+    import warp as wp
+
+    folder, stated = _cubin_places(features, module, architecture)
+    if not _fits(stated, features, module):
+        begin()
+        made = _prepared(_module_of(features, module), features)
+        folder.mkdir(parents=True, exist_ok=True)
+        wp.compile_aot_module(made, arch=architecture, module_dir=folder, use_ptx=False, strip_hash=True)
+        with tempfile.TemporaryDirectory(dir=folder) as unfinished:
+            written = Path(unfinished, "fingerprint")
+            written.write_text(json.dumps({"fingerprint": fingerprint(features, module)}), encoding="utf-8")
+            os.replace(written, stated)
+    return stated
+
+
+def kernel_in_lanes(features: Features, module: str, name: str, device: str) -> Any:
+    """A kernel of Warp's for worlds of several lanes, loaded, and compiled before where nobody has.
+
+    Args:
+        features: What it must know, with its lanes.
+        module: Its module.
+        name: Its name.
+        device: Where it runs, as Warp calls it.
+    """
+    import warp as wp
+
+    begin()
+    kernel = getattr(instance(features, module), name)
+    on = wp.get_device(device)
+    for architecture in architectures_for(on.arch) if on.is_cuda else ():
+        folder, stated = _cubin_places(features, module, architecture)
+        if _fits(stated, features, module):
+            made = _prepared(kernel.module, features)
+            wp.load_aot_module(made, on, architecture, folder, use_ptx=False, strip_hash=True)
+            return kernel
+    return compiled_kernel(lambda: kernel, device, dict(features.values)["LANES"])
+
+
+def architectures_for(architecture: int) -> list[int]:
+    """Those whose machine code runs on a GPU, the best first: of its generation, not younger."""
+    same = (x for x in ARCHITECTURES if x // 10 == architecture // 10 and x <= architecture)
+    return sorted(same, reverse=True)
+
+
+def _module_of(features: Features, module: str) -> Any:
+    import warp as wp
+
+    return next(x for x in vars(instance(features, module)).values() if isinstance(x, wp.Kernel)).module
+
+
+def _prepared(module: Any, features: Features) -> Any:
+    module.options["block_dim"] = dict(features.values)["LANES"]
+    module.options["cuda_output"] = "cubin"
+    return module
+
+
+def _cubin_places(features: Features, module: str, architecture: int) -> tuple[Path, Path]:
+    """Folder of machine code, and the file that states what it was made from."""
+    folder = SHIPPED / f"sm_{architecture}"
+    return folder, folder / f"{file_name(features, module)}.json"
+
+
+def _fits(stated: Path, features: Features, module: str) -> bool:
+    try:
+        content = json.loads(stated.read_text(encoding="utf-8"))
+        return content["fingerprint"] == fingerprint(features, module)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False

@@ -143,6 +143,15 @@ def falling(body: BodyState, falls: int) -> BodyState:
 
 
 @wp.func
+def is_with_fixed(first: BodyState, second: BodyState) -> bool:
+    """Whether one body of a pair is fixed: their impulses may wait until they meet; on joints none do."""
+    fixed = bool(False)
+    if wp.static(not TREES):
+        fixed = first.inverse_mass == ZERO or second.inverse_mass == ZERO
+    return fixed
+
+
+@wp.func
 def falling_bar(bar: BodyState, falls: int) -> BodyState:
     """Derivatives by a body from those by what `falling` makes of it."""
     found = bar
@@ -242,10 +251,26 @@ def speed_within(pose: PairPose, x: vec3, radius: real) -> real:
         x: Centre of the ball [m].
         radius: Its radius [m].
     """
-    arm = x - pose.com
-    speed = wp.length(pose.velocity + wp.cross(pose.spin, arm)) + wp.length(pose.spin) * radius
-    gained = wp.length(pose.spin_gained_on_way) * (wp.length(arm) + radius)
-    return speed + wp.length(pose.gained_on_way) + gained
+    return speed_in_ball(pose, x, radius) + gained_within(pose, x, radius)
+
+
+@wp.func
+def speed_in_ball(pose: PairPose, x: vec3, radius: real) -> real:
+    """The same at the old velocities [m/s]."""
+    return wp.length(pose.velocity + wp.cross(pose.spin, x - pose.com)) + wp.length(pose.spin) * radius
+
+
+@wp.func
+def gained_within(pose: PairPose, x: vec3, radius: real) -> real:
+    """Most that velocities of points of the first body in a ball have gained on their way [m/s].
+
+    Args:
+        pose: The pair.
+        x: Centre of the ball [m].
+        radius: Its radius [m].
+    """
+    of_spin = wp.length(pose.spin_gained_on_way) * (wp.length(x - pose.com) + radius)
+    return wp.length(pose.gained_on_way) + of_spin
 
 
 @wp.func

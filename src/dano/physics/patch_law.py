@@ -74,7 +74,6 @@ class PatchLinear:
     roll: Friction  # Rolling friction [N m], without drag
     drag: real  # F_n that drag is in proportion to [N]
     drag_damping: real  # −∂/∂v_n of it [N s/m]
-    held: real  # Normal force whose friction bounds are held [N]
 
 
 @wp.struct
@@ -158,13 +157,11 @@ def friction_of(material: PatchMaterial, u: vec3, bound: real) -> vec3:
 
 
 @wp.func
-def resistance(
-    material: PatchMaterial, u: vec3, dual: vec3, bound: real, bound_damping: real, softness: real
-) -> Friction:
+def resistance(material: PatchMaterial, u: vec3, dual: vec3, bound: real, bound_damping: real) -> Friction:
     """Friction of at most b against a velocity u, of whichever kind the material has."""
     found = Friction()
     if material.stiction > ZERO:
-        found = friction_with_dual(u, dual, bound, bound_damping, softness * material.stiction, ZERO)
+        found = friction_with_dual(u, dual, bound, bound_damping, material.stiction, ZERO)
     else:
         found = smooth_friction(material, u, bound, bound_damping)
     return found
@@ -177,10 +174,7 @@ def linearized_patch(
     adhesive: bool,
     motion: PatchMotion,
     duals: PatchDuals,
-    softness: real,
-    holds: bool,
-    mix: real,
-    held: real,
+    share: real,
 ) -> PatchLinear:
     """One linearisation of the law with its duals.
 
@@ -190,28 +184,20 @@ def linearized_patch(
         adhesive: Whether the normal force may pull.
         motion: At the patch.
         duals: The duals; unused where friction is smooth.
-        softness: Multiplies the stiction velocity.
-        holds: Whether friction is that of a normal force that is held, whatever the force is.
-        mix: Share of that one which is renewed first, from the force as it is.
-        held: That one [N].
+        share: Of its friction.
     """
     found = PatchLinear()
     found.normal = normal_force(material, overlap, motion.rate, adhesive)
-    pressing = found.normal.size
-    damping = found.normal.damping
-    found.held = held
-    if holds:
-        found.held = held + mix * (pressing - held)
-        pressing = found.held
-        damping = ZERO
+    pressing = share * found.normal.size
+    damping = share * found.normal.damping
     found.drag = pressing
     found.drag_damping = damping
     mu = material.sliding_friction
-    found.slide = resistance(material, motion.slip, duals.slide, mu * pressing, mu * damping, softness)
+    found.slide = resistance(material, motion.slip, duals.slide, mu * pressing, mu * damping)
     mu = material.torsional_friction
-    found.drill = resistance(material, motion.drill, duals.drill, mu * pressing, mu * damping, softness)
+    found.drill = resistance(material, motion.drill, duals.drill, mu * pressing, mu * damping)
     mu = material.rolling_friction
-    found.roll = resistance(material, motion.roll, duals.roll, mu * pressing, mu * damping, softness)
+    found.roll = resistance(material, motion.roll, duals.roll, mu * pressing, mu * damping)
     return found
 
 

@@ -168,7 +168,6 @@ class Linear:
     turning: vec3  # l [Pa s/m], zero where the point sticks
     slip_direction: vec3  # û, unit slip, zero where the point sticks
     by_pressure: vec3  # b′ f c [Pa s/m]
-    held: real  # Largest friction that is held [Pa]
 
 
 @wp.func
@@ -362,42 +361,36 @@ def slip_at(law: PointLaw, slip: vec3, grip: real) -> Slip:
 
 
 @wp.func
+def fitting_direction(law: PointLaw, rate: real) -> real:
+    """The dual s that fits a separating speed."""
+    return rate / wp.max(wp.abs(rate), law.stiction)
+
+
+@wp.func
 def fitting_duals(law: PointLaw, motion: Motion) -> Duals:
     """Duals that fit given velocities."""
     duals = Duals()
-    duals.direction = motion.rate / wp.max(wp.abs(motion.rate), law.stiction)
+    duals.direction = fitting_direction(law, motion.rate)
     duals.friction = traction(law, motion.rate, motion.slip).friction
     return duals
 
 
 @wp.func
-def linearized(
-    law: PointLaw, motion: Motion, duals: Duals, softness: real, holds: bool, mix: real, held: real
-) -> Linear:
+def linearized(law: PointLaw, motion: Motion, duals: Duals, share: real) -> Linear:
     """One linearisation of the law with its duals.
 
     Args:
         law: Constants of the point.
         motion: Of the point.
         duals: The duals.
-        softness: Multiplies the stiction velocity.
-        holds: Whether the largest friction is the one that is held, whatever the pressure.
-        mix: Share of that one which is renewed first, from the pressure as it is.
-        held: That one [Pa].
+        share: Of its friction.
     """
     found = Linear()
-    stiction = law.stiction * softness
-    found.pressure = pressure(law, motion.rate, duals.direction, stiction)
+    found.pressure = pressure(law, motion.rate, duals.direction, law.stiction)
     bound = friction_bound(law, found.pressure.value)
-    limit = bound.value
-    marginal = bound.marginal
-    found.held = held
-    if holds:
-        found.held = held + mix * (limit - held)
-        limit = found.held
-        marginal = ZERO
-    damping = marginal * found.pressure.damping
-    own = friction_with_dual(motion.slip, duals.friction, limit, damping, stiction, law.gradual)
+    limit = share * bound.value
+    damping = share * bound.marginal * found.pressure.damping
+    own = friction_with_dual(motion.slip, duals.friction, limit, damping, law.stiction, law.gradual)
     found.friction = own.value
     found.friction_change = own.change
     found.grip = own.grip

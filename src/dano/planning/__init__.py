@@ -7,7 +7,6 @@ from dano.planning._execution import (
     Replan as Replan,
     Replanning as Replanning,
 )
-from dano.planning._options import PlanOptions as PlanOptions
 from dano.planning._plan import (
     GoalError as GoalError,
     load_controls as load_controls,
@@ -15,6 +14,7 @@ from dano.planning._plan import (
     METHODS as METHODS,
     Plan as Plan,
     plan as plan,
+    PlanOptions as PlanOptions,
 )
 from dano.planning._problem import gradual as gradual, problem_of as problem_of, softened as softened
 from dano.planning._sampling import FIRST_DRAWS as FIRST_DRAWS, SamplingOptions as SamplingOptions

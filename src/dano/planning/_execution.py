@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 
 from dano.checks import checked_count, checked_kind, checked_optional
 from dano.engine import AbstractEngine, checked_engine, compiler_options
-from dano.planning._options import PlanOptions
-from dano.planning._plan import goal_errors, GoalError, Plan
+from dano.planning._plan import goal_errors, GoalError, Plan, PlanOptions
 from dano.planning._problem import Difference, problem_of, Scales, VIOLATION
 from dano.planning._task import Task
 from dano.scene import Scene, State

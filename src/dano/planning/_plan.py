@@ -1,10 +1,10 @@
-"""The verb: a plan for a scene and a task."""
+"""The verb: a plan for a scene and a task, and how it is searched for."""
 
 import dataclasses
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -16,15 +16,59 @@ from jaxtyping import Array, Float
 
 from dano import checks, solvers
 from dano.archive import read_archive, write_archive
+from dano.checks import checked_count, checked_items, checked_kind
 from dano.engine import AbstractEngine, checked_engine, compiler_options, simulate
 from dano.gradients import Check, check
 from dano.maths import checked_array
 from dano.planning._exploring import explored, to_touch
-from dano.planning._options import PlanOptions
 from dano.planning._problem import gradual, problem_of, Scales, softened, VIOLATION
-from dano.planning._sampling import costs, rated, sampled
+from dano.planning._sampling import costs, rated, sampled, SamplingOptions
 from dano.planning._task import Limit, Task
 from dano.scene import Control, Scene, State, state_arrays, Trajectory
+from dano.solvers import TrajectoryOptions
+
+_ILQR = TrajectoryOptions(
+    tolerance=1e-4, constraint_tolerance=VIOLATION, max_iterations=40, max_updates=20, penalty=10.0
+)
+"""Of plans through contact, whose last digits mean nothing."""
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """How a plan is searched for.
+
+    Attributes:
+        explore: Passes of CEM that improve the first guess of iLQR; 0 for none. None: where with the first
+            guess no driven body touches one that misses its goal, paths that lead to contact are looked for,
+            because derivatives do not lead there. The plan then says so (`Plan.explored`).
+        softening: Factors < 1 of the contacts' stiffness to plan with first; each plan starts from the one
+            before.
+        ilqr: Of iLQR.
+        sampling: Of CEM and MPPI.
+        seed: Of the samples.
+    """
+
+    explore: int | None = None
+    softening: Sequence[float] = ()
+    ilqr: TrajectoryOptions = _ILQR
+    sampling: SamplingOptions = SamplingOptions()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check all.
+
+        Raises:
+            ValueError: If one is out of range, or of another kind.
+        """
+        if self.explore is not None:
+            checked_count("explore", self.explore, least=0)
+        for factor in checked_items("softening", self.softening, float, int):
+            if not 0 < factor < 1:
+                raise ValueError(f"softening must hold factors between 0 and 1, got {factor}")
+        checked_kind("ilqr", self.ilqr, TrajectoryOptions)
+        checked_kind("sampling", self.sampling, SamplingOptions)
+        checked_count("seed", self.seed, least=0)
+
 
 # Searches for contact, each with other random numbers, until a plan meets what is required.
 _ATTEMPTS = 3

@@ -1,6 +1,11 @@
 """Robots: files of links and joints in, bodies and joints of a scene out; kinematics and dynamics."""
 
 from dano.robots._build import build_robot as build_robot
+from dano.robots._control import (
+    JointPD as JointPD,
+    operational_space_torque as operational_space_torque,
+    pd as pd,
+)
 from dano.robots._dynamics import (
     bias_forces as bias_forces,
     computed_torque as computed_torque,
@@ -20,13 +25,12 @@ from dano.robots._inspect import (
     robot_tree as robot_tree,
 )
 from dano.robots._inverse import (
+    close_loops as close_loops,
     inverse_kinematics as inverse_kinematics,
     InverseKinematics as InverseKinematics,
+    loop_gaps as loop_gaps,
     Target as Target,
 )
-from dano.robots._loops import close_loops as close_loops, loop_gaps as loop_gaps
-from dano.robots._operational import operational_space_torque as operational_space_torque
-from dano.robots._pd import JointPD as JointPD, pd as pd
 from dano.robots._robot import Robot as Robot
 from dano.robots.formats import (
     at_home as at_home,

@@ -10,8 +10,8 @@ from dano import fields, maths, scene
 from dano.checks import shown
 from dano.robots import _parts, formats
 from dano.robots._dynamics import balanced, chained, Inertial
-from dano.robots._free import FREE_JOINTS, without_free_laws
 from dano.robots._geometry import checked_collision, shape_of
+from dano.robots._parts import FREE_JOINTS, without_free_laws
 from dano.robots._robot import PLANE, Robot
 
 # Radius of what stands for a link without a shape, in pictures only [m].

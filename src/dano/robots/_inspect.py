@@ -12,7 +12,7 @@ from dano.archive import checked_input
 from dano.maths import Pose
 from dano.robots._build import build_robot
 from dano.robots._dynamics import excess, grouped_links, own_inertials, ROUNDED, weightless_joints
-from dano.robots._free import FREE_JOINTS, laws_of
+from dano.robots._parts import FREE_JOINTS, laws_of
 from dano.robots._robot import Robot
 from dano.robots.formats import Connection, Description, Link, read_mjcf, read_urdf, WEIGHTLESS
 

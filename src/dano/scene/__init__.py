@@ -1,11 +1,7 @@
 """Scenes: what exists, what may touch, and the states it moves through."""
 
-from dano.scene._bodies import Body as Body
-from dano.scene._contacts import (
-    colliders as colliders,
-    Contact as Contact,
-    pressing_pairs as pressing_pairs,
-)
+from dano.scene._bodies import Body as Body, pressing_pairs as pressing_pairs
+from dano.scene._contacts import colliders as colliders, Contact as Contact
 from dano.scene._doubts import (
     box_volume as box_volume,
     say_doubts as say_doubts,
@@ -29,11 +25,13 @@ from dano.scene._joints import (
     Joint as Joint,
     JOINT_KINDS as JOINT_KINDS,
     JointLaws as JointLaws,
+    Loop as Loop,
+    LOOP_KINDS as LOOP_KINDS,
+    Loops as Loops,
     Motor as Motor,
     MOTOR_KINDS as MOTOR_KINDS,
     StateLayout as StateLayout,
 )
-from dano.scene._loops import Loop as Loop, LOOP_KINDS as LOOP_KINDS, Loops as Loops
 from dano.scene._others import (
     Others as Others,
     touching_pairs as touching_pairs,

@@ -6,7 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from dano.contact import (
     AbstractContactLaw,
@@ -152,27 +152,6 @@ def _collider(body: Body, other: Body, edge: Float[Array, ""] | None) -> Collide
     # Against a neural object a primitive has no samples of its own (paper: the sum runs over the object's).
     samples = body.samples if other.object is None else None
     return Collider(_shape_with_edge(body.shape, edge), samples, body.support, body.density_scale)
-
-
-def pressing_pairs(bodies: Sequence[Body], ends: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, "pairs 3"]:
-    """Pairs (first, second, contact) of which the first body's samples press on the second's solid.
-
-    Args:
-        bodies: All bodies.
-        ends: Indices of the bodies of each contact with a point law.
-
-    Both bodies' samples do where both have some. Against a ball or an ellipsoid a box's do not: the ball's
-    own lie where it comes closest, and are enough.
-    """
-    turning = [None if body.surface is None else body.surface.turning for body in bodies]
-    sampled = np.array([turns is not None for turns in turning], bool)
-    ball = np.array([turns == "ball" for turns in turning], bool)
-    is_object = np.array([body.object is not None for body in bodies], bool)
-    has_solid = np.array([body.solid is not None for body in bodies], bool)
-    first, second = np.stack([ends, ends[:, ::-1]], axis=1).reshape(-1, 2).T
-    contact = np.repeat(np.arange(len(ends)), 2)
-    press = sampled[first] & has_solid[second] & ~(ball[second] & ~ball[first] & ~is_object[first])
-    return np.stack([first, second, contact], axis=1)[press]
 
 
 def _shape_with_edge(shape: AbstractShape, edge: Array | None) -> AbstractShape:

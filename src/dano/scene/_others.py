@@ -21,8 +21,7 @@ from dano.scene._contacts import (
     heaviest,
     with_surfaces,
 )
-from dano.scene._joints import Joint, unjoined
-from dano.scene._loops import Loop
+from dano.scene._joints import Joint, Loop, unjoined
 
 MOST_LISTED = 200
 """Pairs that a scene lists as contacts unasked: those of twenty bodies. A contact takes 8 ms to make, and its

@@ -19,19 +19,22 @@ from dano.contact import checked_parameter, ContactParams, Distance, distance, D
 from dano.names import did_you_mean
 from dano.objects import checked_inertia
 from dano.scene._bodies import Body
-from dano.scene._by_name import ByName, control_arrays, joint_arrays, merged, started, state_arrays
 from dano.scene._contacts import Contact, prepared
 from dano.scene._doubts import doubts_of_scene, doubts_of_state, say_doubts, SceneDoubt
 from dano.scene._frames import Chains, chains_of, filled, Frames, frames_of, joint_values
-from dano.scene._joints import Joint, layout_of, Motor, StateLayout
-from dano.scene._loops import check_loops, Loop, Loops, loops_of
+from dano.scene._joints import check_loops, Joint, layout_of, Loop, Loops, loops_of, Motor, StateLayout
 from dano.scene._making import (
+    ByName,
     check_contacts,
     check_materials,
     check_names,
+    control_arrays,
+    joint_arrays,
+    merged,
     room_for,
     sampled_alike,
-    structure,
+    started,
+    state_arrays,
     twins_of,
     warn_of_limits,
     warn_of_long_steps,
@@ -133,7 +136,7 @@ class Scene(eqx.Module):
         contacts = checks.checked_items("contacts", () if contacts is None else contacts, Contact)
         timestep = maths.checked_array("timestep", timestep, (), above=0.0)
         check_contacts(bodies, joints, contacts)
-        children = layout_of(*structure(bodies, joints)).children
+        children = layout_of(bodies, joints).children
         check_loops([body.name for body in bodies], children, loops)
         gravity = maths.checked_array("gravity", gravity, (3,))
         # Before the bodies are prepared, which makes new ones.
@@ -190,7 +193,7 @@ class Scene(eqx.Module):
     @property
     def layout(self) -> StateLayout:
         """Which numbers say how the bodies stand and move."""
-        return layout_of(*structure(self.bodies, self.joints))
+        return layout_of(self.bodies, self.joints)
 
     @property
     def chains(self) -> Chains:

@@ -14,6 +14,7 @@ from dano.physics.momentum import angular_momentum, angular_momentum_jacobian
 from dano.physics.pairs import FIXED
 from dano.physics.point_law import (
     Duals,
+    fitting_direction,
     fitting_duals,
     following_duals,
     is_apart,
@@ -46,7 +47,6 @@ class Fit:
 
     unfit: real  # What friction and pressure of single points miss [N s]
     push: real  # All pressure [N s]
-    renewed: real  # By how much held friction bounds changed [N s]
 
 
 @wp.struct
@@ -77,9 +77,7 @@ class Trial:
     """What a pass tries."""
 
     length: real  # Share of Newton's step
-    softness: real  # Multiplies the stiction velocity
-    holds: bool  # Whether friction bounds are held
-    mix: real  # Share of them that is renewed
+    friction: real  # Share of the friction that there is
 
 
 @wp.func
@@ -143,7 +141,6 @@ def fit_duals(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n
         for k in range(found.first, found.end):
             room.duals[world, k] = Duals()
             room.changes[world, k] = Duals()
-            room.linear[world, k].held = ZERO
             room.marks[world, k] = 0
             if not is_apart(room.gates[world, k], twist.velocity, twist.spin):
                 point = room.points[world, k]
@@ -360,7 +357,7 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
         for k in range(found.first, found.end):
             mark = room.marks[world, k]
             known = wp.where(mark >= _PRESSES, mark - _PRESSES, mark)
-            if is_apart(room.gates[world, k], twist.velocity, twist.spin) and not trial.holds:
+            if is_apart(room.gates[world, k], twist.velocity, twist.spin):
                 if mark != known:
                     room.marks[world, k] = known
             else:
@@ -371,11 +368,13 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
                 changes = room.changes[world, k]
                 duals.friction = duals.friction + trial.length * changes.friction
                 duals.direction = duals.direction + trial.length * changes.direction
-                held = room.linear[world, k].held
-                linear = linearized(law, motion, duals, trial.softness, trial.holds, trial.mix, held)
+                if known == 0:
+                    # A point that comes in has no history; 0 would make it as stiff as one that sticks.
+                    duals.direction = fitting_direction(law, motion.rate)
+                    room.duals[world, k].direction = duals.direction
+                linear = linearized(law, motion, duals, trial.friction)
                 room.linear[world, k] = linear
                 weight = h * point.area
-                fit.renewed += weight * wp.abs(linear.held - held)
                 room.marks[world, k] = known
                 if linear.pressure.value > ZERO or linear.grip > ZERO:
                     room.marks[world, k] = _PRESSES + known
@@ -392,5 +391,4 @@ def assemble(scene: Scene, room: Room, world: int, lane: int, n_found: int, tria
             room.wrenches[world, f] = wrench
     fit.unfit = total(fit.unfit)
     fit.push = total(fit.push)
-    fit.renewed = total(fit.renewed)
     return fit

@@ -46,7 +46,10 @@ def is_quiet(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundP
 
 @wp.func
 def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_found: int):
-    """Have both sides of a pair take part in one impact: samples of the first body, and of the second."""
+    """Have both sides of a pair take part in one impact: samples of the first body, and of the second.
+
+    Both note where the other one is.
+    """
     for f in range(1, n_found):
         one = (f - 1) * _LANES + lane
         other = f * _LANES + lane
@@ -57,6 +60,8 @@ def share_impacts(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: in
             if hits and room.found[world, other].impact.stiffness > ZERO:
                 room.found[world, one].impact.part = HALF
                 room.found[world, other].impact.part = HALF
+                room.found[world, one].other = 1
+                room.found[world, other].other = -1
 
 
 @wp.func
@@ -195,13 +200,12 @@ def let_wait(scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, n_
     for f in range(n_found):
         k = f * _LANES + lane
         found = room.found[world, k]
-        if found.impact.delays > ZERO:
+        if found.waits > 0:
             index = scene.pair_index[found.pair]
             first = may_wait(scene, room, world, index.first, index.second, found)
             second = may_wait(scene, room, world, index.second, index.first, found)
-            if first and second:
-                found.waits = 1
-            else:
+            if not (first and second):
+                found.waits = 0
                 found.impact = delayed(found.impact, ZERO, found.share, h)
             room.found[world, k] = found
     wait()

@@ -4,7 +4,9 @@ import warp as wp
 
 from dano.engine.kernels.lanes import first_of, least
 from dano.engine.kernels.near import (
-    find_near_blocks,
+    blocks_to_ask,
+    bound_of_block,
+    far_until,
     gain_of,
     middle_of,
     NearPair,
@@ -14,6 +16,7 @@ from dano.engine.kernels.near import (
     reach_of_block,
     solid_of_body,
     stretch_of,
+    view_of,
 )
 from dano.engine.kernels.tables import BLOCK, Room, Scene
 from dano.physics.features import LANES, WIDE
@@ -21,12 +24,14 @@ from dano.physics.pairs import (
     approach,
     BodyState,
     PairPose,
+    speed_in_ball,
     spin_of_samples,
     way_of,
 )
 from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec3, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.samples import position_in_solid, solid_normal
+from dano.physics.solids.bounds import bound_at, GridView
 from dano.physics.solids.distances import Solid, solid_distance
 from dano.physics.solids.grids import STEEPEST
 from dano.physics.solids.kinds import HALF_SPACE
@@ -40,6 +45,8 @@ _ADVANCES = wp.constant(200)
 _MET = wp.constant(real(1e-12 if WIDE else 1e-6))
 _ONWARD = wp.constant(real(1.0 / 32.0))
 _FLAT = wp.constant(real(1e-9))
+# Room for rounding beside bounds, and the share of a depth below which they say nothing.
+_ROOM, _TOUCHES = wp.constant(real(1.0001)), wp.constant(real(1e-6))
 
 
 @wp.struct
@@ -125,6 +132,9 @@ class Ask:
     h: real  # Timestep [s]
     slow: real  # What nears the solid by no more in a step does not count [m]
     most: real  # By no more does anything near it in a step [m]
+    gain: real  # Most of this that velocities gain [m]
+    deep: real  # What sinks in deeper than so much is counted in `Soonest.close` [m]
+    view: GridView  # What they near, if it is a grid
     bend: real  # By how much that grows in a step at most [m]
     rest: real  # Share of the step that is left
     turning: int  # How samples turn
@@ -144,17 +154,64 @@ class Soonest:
 
 
 @wp.func
+def sooner_by_bound(low: real, fastest: real, ask: Ask) -> real:
+    """Share of the step before which nothing meets that is no nearer and no faster, −∞ where that is none.
+
+    Args:
+        low: Beneath its distance [m].
+        fastest: By no more does it near the solid in a step [m].
+        ask: What is asked.
+    """
+    left = low + ask.sink
+    if left > _TOUCHES * ask.sink:
+        return ahead_of(left, fastest, ask.bend) / _ROOM
+    return -INFINITY
+
+
+@wp.func
 def look_at_block(
-    scene: wp.ref[Scene], world: int, solid: Solid, pose: PairPose, ask: Ask, block: int, seen: Soonest
+    scene: wp.ref[Scene],
+    world: int,
+    solid: Solid,
+    pose: wp.ref[PairPose],
+    ask: wp.ref[Ask],
+    block: int,
+    bound: real,
+    seen: Soonest,
 ) -> Soonest:
-    """What the samples of a block say besides those seen before; where they cannot be sooner, its middle."""
+    """What the samples of a block say besides those seen before; where they cannot be sooner, its middle.
+
+    Args:
+        scene: The scene.
+        world: Which world.
+        solid: The solid.
+        pose: Of the pair.
+        ask: What is asked.
+        block: The block.
+        bound: None of its samples is known to be nearer [m].
+        seen: What those before say.
+    """
     found = seen
     found.block = INFINITY
     ball = scene.balls[world, block]
     x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
-    d = solid_distance(scene.solids, world, solid, x)
     # Samples of a block are no nearer than its middle, less its radius.
     radius = reach_of_block(scene, world, pose, ask.plane, block, ask.stretch)
+    most = ask.rest * ask.most
+    fastest = real(INFINITY)
+    if ask.view.known:
+        fastest = _ROOM * (ask.h * speed_in_ball(pose, x, ball[3]) + ask.gain)
+        # Where it is known that something is fast enough, what cannot be sooner says nothing else.
+        least = wp.where(found.fastest > ask.slow, wp.min(found.further, ask.rest), INFINITY)
+        found.block = sooner_by_bound(bound, fastest, ask)
+        if bound > most or found.block >= least:
+            return found
+        low = bound_at(scene.solids, world, ask.view, vec3(ball[0], ball[1], ball[2]), most + radius) - radius
+        found.block = sooner_by_bound(low, fastest, ask)
+        if low > most or found.block >= least:
+            return found
+        found.block = INFINITY
+    d = solid_distance(scene.solids, world, solid, x)
     asked = ask.turning != 0
     if d.value - radius <= ask.rest * ask.most:
         middle = nearing(pose, ask.turning, x, d, ask.sink, ask.h, ask.slow)
@@ -168,6 +225,16 @@ def look_at_block(
         found.block = INFINITY
         for s in range(_BLOCK * block, _BLOCK * block + _BLOCK):
             x = position_in_solid(pose, scene.samples[world, s].point)
+            if ask.view.known:
+                low = bound_at(scene.solids, world, ask.view, scene.samples[world, s].point, most)
+                if low > most:
+                    continue
+                ahead = sooner_by_bound(low, fastest, ask)
+                # The first that sinks in so deep that it says something says it for others, too.
+                sinks = found.close >= -ask.deep and low - (fastest + HALF * ask.bend) < -ask.deep
+                if found.fastest > ask.slow and ahead >= wp.min(found.further, ask.rest) and not sinks:
+                    found.block = wp.min(found.block, ahead)
+                    continue
             d = solid_distance(scene.solids, world, solid, x)
             if d.value <= ask.rest * ask.most:
                 own = nearing(pose, ask.turning, x, d, ask.sink, ask.h, ask.slow)
@@ -185,6 +252,33 @@ def look_at_block(
                         found.further = ahead
                         found.critical = s
     return found
+
+
+@wp.func
+def fastest_beside(
+    scene: wp.ref[Scene],
+    world: int,
+    pair: NearPair,
+    solid: Solid,
+    pose: wp.ref[PairPose],
+    ask: wp.ref[Ask],
+    way: real,
+) -> real:
+    """Most by which a sample within a way [m] nears a solid in a step [m]; if none is fast enough, less."""
+    index = scene.body_index[pair.first]
+    seen = Soonest()
+    seen.further = INFINITY
+    i = int(0)
+    while i < index.blocks and seen.fastest <= ask.slow:
+        after = far_until(scene, world, solid, ask.view, pose, index, i, way, ONE)
+        if after == i:
+            after = i + 1
+            ball = scene.balls[world, index.first_block + i]
+            x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
+            if _ROOM * ask.h * speed_in_ball(pose, x, ball[3]) > ask.slow:
+                seen = look_at_block(scene, world, solid, pose, ask, index.first_block + i, -INFINITY, seen)
+        i = after
+    return seen.fastest
 
 
 @wp.func
@@ -255,6 +349,8 @@ def ask_of(
         gain = pair.h * gain_of(a, b, wp.length(middle_of(body, a) - a.position) + body.radius)
         way += real(1.5) * gain
         ask.most = STEEPEST * (most + real(1.5) * gain)
+        ask.gain = real(1.5) * gain
+        ask.deep = wp.max(pair.numbers.sink, pair.numbers.impact_depth)
         ask.bend = way * pair.h * (wp.length(turns) + TWO * wp.length(b.spin)) + gain
         ask.sink = limits.sink
         ask.h = pair.h
@@ -302,22 +398,27 @@ def meeting(
     while k < _ADVANCES:
         pose = posed(scene, world, pair, a, b, share)
         if n < 0:
-            n, likely = find_near_blocks(scene, room, world, lane, pair, pose, STEEPEST * way - limits.sink)
+            n, likely = blocks_to_ask(scene, room, world, lane, pair, pose, STEEPEST * way - limits.sink)
         seen = Soonest()
         seen.further = INFINITY
         seen.critical = -1
         ask.rest = ONE - share
+        ask.view = view_of(solid, pose, pair.turning)
         # What is soonest most likely comes first: it rules others out.
         if likely >= 0:
-            seen = look_at_block(scene, world, solid, pose, ask, likely, seen)
+            seen = look_at_block(scene, world, solid, pose, ask, likely, -INFINITY, seen)
         for i in range(n):
             block = room.near[world, at + i]
             if block == likely:
                 if again:
                     room.until[world, at + i] = share
             elif again or room.until[world, at + i] < wp.min(share + seen.further, ONE):
-                seen = look_at_block(scene, world, solid, pose, ask, block, seen)
+                bound = bound_of_block(room, world, pair, i, k)
+                seen = look_at_block(scene, world, solid, pose, ask, block, bound, seen)
                 room.until[world, at + i] = share + seen.block
+        if k == 0 and pair.some >= 0 and limits.slow > ZERO and seen.fastest <= limits.slow:
+            # Whether anything nears the solid is asked of what cannot meet it, too.
+            seen.fastest = fastest_beside(scene, world, pair, solid, pose, ask, STEEPEST * way - limits.sink)
         closest = least(seen.further)
         critical = seen.critical
         if closest < seen.further:

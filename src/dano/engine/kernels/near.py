@@ -2,20 +2,45 @@
 
 import warp as wp
 
-from dano.engine.kernels.tables import BLOCK, Body, FoundPair, numbers_of, Room, RUN, SamplePair, Scene
+from dano.engine.kernels.tables import (
+    BLOCK,
+    Body,
+    BodyIndex,
+    FoundPair,
+    LEVELS,
+    numbers_of,
+    Room,
+    RUN,
+    SamplePair,
+    Scene,
+)
 from dano.physics.features import LANES, TREES
 from dano.physics.impacts import share_left_out, supported
-from dano.physics.pairs import BodyState, facing_direction, falling, pair_pose, PairPose
-from dano.physics.real import INFINITY, ONE, real, vec3, ZERO
+from dano.physics.pairs import (
+    BodyState,
+    facing_direction,
+    falling,
+    pair_pose,
+    PairPose,
+    speed_in_ball,
+    way_of,
+)
+from dano.physics.real import INFINITY, ONE, real, TWO, vec3, vec4, ZERO
 from dano.physics.rotations import matrix
 from dano.physics.samples import solid_normal
+from dano.physics.solids.bounds import bound_at, bound_in_ball, GridView, QUICK, view_of_grid
 from dano.physics.solids.distances import Solid, solid_clearance, solid_distance, solid_of
 from dano.physics.solids.grids import STEEPEST
 from dano.physics.solids.kinds import HALF_SPACE
 from dano.physics.twists import wrench_at
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
+# A run has four times as many blocks as the next smaller one.
+_TWICE = wp.constant(2)
+_LEVELS, _LARGEST = wp.constant(LEVELS), wp.constant(RUN**LEVELS)
 _HALF_SPACE = wp.constant(HALF_SPACE)
+# From so many blocks on it is asked first whether a body is near another.
+_MANY = wp.constant(RUN**2)
 
 
 @wp.struct
@@ -28,6 +53,7 @@ class NearPair:
     turning: int  # How samples of the first body turn
     h: real  # Timestep [s]
     numbers: SamplePair
+    some: int  # How many blocks `room.some` has for it, −1 for all
 
 
 @wp.func
@@ -41,6 +67,7 @@ def near_pair(scene: wp.ref[Scene], world: int, place: int) -> NearPair:
     pair.turning = scene.body_index[index.first].turning
     pair.h = scene.timestep[world, 0]
     pair.numbers = numbers_of(scene, world, place)
+    pair.some = -1
     return pair
 
 
@@ -88,14 +115,70 @@ def reach_of_block(
 
 
 @wp.func
+def view_of(solid: Solid, pose: PairPose, turning: int) -> GridView:
+    """A solid as the samples of a pair see it."""
+    return view_of_grid(solid, pose.points, pose.origin, turning)
+
+
+@wp.func
 def is_run_far(
-    scene: wp.ref[Scene], world: int, solid: Solid, pose: PairPose, block: int, way: real, stretch: real
+    scene: wp.ref[Scene],
+    world: int,
+    solid: Solid,
+    view: GridView,
+    pose: PairPose,
+    run: vec4,
+    radius: real,
+    way: real,
 ) -> bool:
-    """Whether all blocks of the run that begins with one are further from a solid than a way [m]."""
-    run = scene.runs[world, block]
-    x = pose.points * vec3(run[0], run[1], run[2]) + pose.origin
-    far = way + STEEPEST * run[3] * stretch
-    return solid_clearance(scene.solids, world, solid, x, far) > far
+    """Whether all blocks of a run, in a ball with a radius, are further from a solid than a way [m]."""
+    middle = vec3(run[0], run[1], run[2])
+    if wp.static(QUICK):
+        if view.known:
+            return bound_in_ball(scene.solids, world, view, middle, radius, way) > way
+    far = way + STEEPEST * radius
+    return solid_clearance(scene.solids, world, solid, pose.points * middle + pose.origin, far) > far
+
+
+@wp.func
+def clearance_of_block(
+    scene: wp.ref[Scene], world: int, solid: Solid, view: GridView, pose: PairPose, ball: vec4, far: real
+) -> real:
+    """A lower bound on the clearance of the middle of a block [m]; where it exceeds `far`, any that does."""
+    middle = vec3(ball[0], ball[1], ball[2])
+    if wp.static(QUICK):
+        if view.known:
+            return bound_at(scene.solids, world, view, middle, far)
+    return solid_clearance(scene.solids, world, solid, pose.points * middle + pose.origin, far)
+
+
+@wp.func
+def far_until(
+    scene: wp.ref[Scene],
+    world: int,
+    solid: Solid,
+    view: GridView,
+    pose: PairPose,
+    index: BodyIndex,
+    i: int,
+    way: real,
+    stretch: real,
+) -> int:
+    """The end of the largest run of blocks from a body's i-th on that is further from a solid than a way [m].
+
+    Returns:
+        Number of the block behind it in the body, i where there is none.
+    """
+    size = int(_LARGEST)
+    beside = int(_LEVELS)
+    while beside > 0:
+        beside -= 1
+        if i & (size - 1) == 0 and i + (size >> _TWICE) < index.blocks:
+            run = scene.runs[world, index.first_block + i + beside]
+            if is_run_far(scene, world, solid, view, pose, run, run[3] * stretch, way):
+                return i + size
+        size = size >> _TWICE
+    return i
 
 
 @wp.func
@@ -194,6 +277,77 @@ def posed(
 
 
 @wp.func
+def find_candidates_of_pair(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    pair: NearPair,
+    a: BodyState,
+    b: BodyState,
+    gain: real,
+) -> int:
+    """Blocks of a pair whose samples may come within the margin of the solid in the step, into `room.some`.
+
+    Each ball has its own way: what turns does not move everywhere as fast as where it is fastest.
+
+    Args:
+        scene: The scene.
+        room: Room.
+        world: Which world.
+        pair: The pair.
+        a: Its first body.
+        b: Its second body.
+        gain: Most that velocities gain in the step [m/s].
+
+    Returns:
+        How many, −1 where they are not looked for.
+    """
+    if wp.static(LANES == 1):
+        index = scene.body_index[pair.first]
+        if index.blocks > _MANY and index.turning == 0:
+            h = pair.h
+            body = scene.bodies[world, pair.first]
+            solid = solid_of_body(scene, world, pair.second)
+            # What velocities gain, and how they turn, seen from the second body.
+            gained = real(1.5) * h * gain
+            way = way_of(a, b, middle_of(body, a), body.radius, h) + gained
+            more = gained + way * h * (wp.length(a.spin - b.spin) + TWO * wp.length(b.spin))
+            more = wp.max(pair.numbers.margin, pair.numbers.impact_depth) + STEEPEST * more
+            pose = posed(scene, world, pair, a, b, ZERO)
+            steep = STEEPEST * h
+            view = view_of(solid, pose, index.turning)
+            found = int(0)
+            i = int(0)
+            while i < index.blocks:
+                after = int(i)
+                size = int(_LARGEST)
+                beside = int(_LEVELS)
+                while after == i and beside >= 0:
+                    beside -= 1
+                    if i & (size - 1) == 0 and i + (size >> _TWICE) < index.blocks:
+                        block = index.first_block + i
+                        ball = scene.balls[world, block]
+                        if beside >= 0:
+                            ball = scene.runs[world, block + beside]
+                        x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
+                        far = more + steep * speed_in_ball(pose, x, ball[3])
+                        if beside >= 0:
+                            if is_run_far(scene, world, solid, view, pose, ball, ball[3], far):
+                                after = i + size
+                        else:
+                            after = i + 1
+                            clear = clearance_of_block(scene, world, solid, view, pose, ball, far + ball[3])
+                            if clear <= far + ball[3]:
+                                room.some[world, found] = block
+                                room.bound[world, found] = clear - ball[3]
+                                found += 1
+                    size = size >> _TWICE
+                i = after
+            return found
+    return -1
+
+
+@wp.func
 def find_near_blocks(
     scene: wp.ref[Scene],
     room: wp.ref[Room],
@@ -212,6 +366,7 @@ def find_near_blocks(
     """
     index = scene.body_index[pair.first]
     solid = solid_of_body(scene, world, pair.second)
+    view = view_of(solid, pose, index.turning)
     closest = INFINITY
     lowest = int(-1)
     found = int(0)
@@ -222,17 +377,13 @@ def find_near_blocks(
         listed = True
         if index.turning == 0:
             if wp.static(LANES == 1):
-                if i < beyond:
-                    listed = False
-                elif i % _RUN == 0:
-                    listed = not is_run_far(scene, world, solid, pose, b, way, ONE)
-                    if not listed:
-                        beyond = i + _RUN
+                if i >= beyond and i % _RUN == 0:
+                    beyond = far_until(scene, world, solid, view, pose, index, i, way, ONE)
+                listed = i >= beyond
             if listed:
                 ball = scene.balls[world, b]
-                x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
                 reach = way + ball[3]
-                clear = solid_clearance(scene.solids, world, solid, x, reach)
+                clear = clearance_of_block(scene, world, solid, view, pose, ball, reach)
                 listed = clear <= reach
                 if clear - ball[3] < closest:
                     closest = clear - ball[3]
@@ -241,3 +392,30 @@ def find_near_blocks(
             room.near[world, at + found] = b
             found += 1
     return found, lowest
+
+
+@wp.func
+def blocks_to_ask(
+    scene: wp.ref[Scene], room: wp.ref[Room], world: int, lane: int, pair: NearPair, pose: PairPose, way: real
+) -> tuple[int, int]:
+    """Blocks whose samples may meet the solid, into `room.near`: those of `room.some` if there are any."""
+    if pair.some < 0:
+        n, closest = find_near_blocks(scene, room, world, lane, pair, pose, way)
+        return n, closest
+    lowest = int(-1)
+    least = real(INFINITY)
+    for i in range(pair.some):
+        block = room.some[world, i]
+        room.near[world, i] = block
+        if room.bound[world, i] < least:
+            least = room.bound[world, i]
+            lowest = block
+    return pair.some, lowest
+
+
+@wp.func
+def bound_of_block(room: wp.ref[Room], world: int, pair: NearPair, i: int, k: int) -> real:
+    """Beneath the clearance of samples of the i-th block that is asked when a step begins [m], if known."""
+    if k == 0 and pair.some >= 0:
+        return room.bound[world, i]
+    return -INFINITY

@@ -324,7 +324,6 @@ def add_patches(
     n = room.patches.count[world, 0]
     unfit = real(0.0)
     push = real(0.0)
-    renewed = real(0.0)
     for k in range(lane, n, _LANES):
         found = room.found[world, (n_found + k) * _LANES + lane]
         c = contact_of(scene, found)
@@ -333,11 +332,8 @@ def add_patches(
         material = scene.patches.materials[world, c]
         motion = motion_at_patch(room, world, c, pair_twist(scene, room, world, found, room.tried, ONE))
         duals = tried_duals(room, world, c, trial.length)
-        held = room.patches.linear[world, c].held
         adhesive = scene.patches.contacts[c].adhesive > 0
-        linear = linearized_patch(
-            material, patch.overlap, adhesive, motion, duals, trial.softness, trial.holds, trial.mix, held
-        )
+        linear = linearized_patch(material, patch.overlap, adhesive, motion, duals, trial.friction)
         room.patches.linear[world, c] = linear
         room.patches.wrenches[world, c] = h * wrench_about_com(
             patch_wrench(material, patch.normal, motion, linear), arm
@@ -347,7 +343,6 @@ def add_patches(
         )
         unfit += h * patch_misfit(material, linear)
         push += h * linear.normal.size
-        renewed += h * wp.abs(linear.held - held)
     wait()
     if lane == 0:
         for k in range(n):
@@ -359,7 +354,6 @@ def add_patches(
             add_contact(scene, room, world, found, m, wrench, room.patches.jacobians[world, c])
     fit.unfit += total(unfit)
     fit.push += total(push)
-    fit.renewed += total(renewed)
     return fit
 
 

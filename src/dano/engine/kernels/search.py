@@ -12,10 +12,14 @@ from dano.engine.kernels.lanes import lanes_where, total, total3
 from dano.engine.kernels.meeting import Limits, limits_of, Meeting, meeting
 from dano.engine.kernels.near import (
     as_they_meet,
+    clearance_of_block,
     facing,
+    far_until,
+    find_candidates_of_pair,
+    gain_of,
     is_near,
-    is_run_far,
     left_out,
+    middle_of,
     near_pair,
     NearPair,
     plane_of,
@@ -23,6 +27,7 @@ from dano.engine.kernels.near import (
     reach_of_block,
     solid_of_body,
     stretch_of,
+    view_of,
 )
 from dano.engine.kernels.sleep import is_idle, wake_near
 from dano.engine.kernels.sweep import find_candidates, may_be_near
@@ -54,6 +59,8 @@ from dano.physics.impacts import (
 from dano.physics.pairs import (
     BodyState,
     falling,
+    gained_within,
+    is_with_fixed,
     PairPose,
     speed_within,
 )
@@ -67,9 +74,12 @@ from dano.physics.samples import (
     position_in_solid,
     solid_normal,
 )
+from dano.physics.solids.bounds import bound_at
 from dano.physics.solids.distances import solid_clearance, solid_distance
 
 _LANES, _BLOCK, _RUN = wp.constant(LANES), wp.constant(BLOCK), wp.constant(RUN)
+# Room for rounding beside a bound.
+_ROOM = wp.constant(real(1.0001))
 
 
 @wp.func
@@ -200,27 +210,33 @@ def find_points(
     rest = (ONE - share) * h
     sinks = wp.where(share < ONE, depth, ZERO)
     reach = wp.max(margin + rest * speed_within(pose, pose.com, TWO * body.radius), sinks)
+    view = view_of(solid, pose, pair.turning)
     beyond = int(0)
+    blocks = wp.where(pair.some >= 0, pair.some, index.blocks)
     # All lanes go through as many rounds: samples of the blocks that are listed in one are shared.
-    for i in range(lane, (index.blocks + _LANES - 1) // _LANES * _LANES, _LANES):
+    for i in range(lane, (blocks + _LANES - 1) // _LANES * _LANES, _LANES):
         b = index.first_block + i
-        listed = i < index.blocks
+        listed = i < blocks
         if wp.static(LANES == 1):
-            if i < beyond:
-                listed = False
-            elif i % _RUN == 0:
-                listed = not is_run_far(scene, world, solid, pose, b, reach, stretch)
-                if not listed:
-                    beyond = i + _RUN
+            if pair.some >= 0:
+                b = room.some[world, i]
+            else:
+                if i >= beyond and i % _RUN == 0:
+                    beyond = far_until(scene, world, solid, view, pose, index, i, reach, stretch)
+                if i < beyond:
+                    listed = False
         near = reach
+        lists = reach
         if listed:
             ball = scene.balls[world, b]
             x = pose.points * vec3(ball[0], ball[1], ball[2]) + pose.origin
             if pair.turning == 0:
                 # Samples that are fixed to the body move as the middle of their block, or nearly.
                 near = wp.min(reach, wp.max(margin + rest * speed_within(pose, x, ball[3]), sinks))
+                # What has gained speed on its way is listed from a little further away.
+                lists = _ROOM * wp.min(reach, near + wp.abs(share) * h * gained_within(pose, x, ball[3]))
             far = near + reach_of_block(scene, world, pose, plane, b, stretch)
-            listed = solid_clearance(scene.solids, world, solid, x, far) <= far
+            listed = clearance_of_block(scene, world, solid, view, pose, ball, far) <= far
         left = lanes_where(lane, listed)
         while left != wp.uint32(0):
             share_of = block_share(lane, left)
@@ -228,6 +244,9 @@ def find_points(
             first_sample = _BLOCK * (b - lane + share_of.block) + share_of.begin
             for s in range(first_sample, first_sample + share_of.count):
                 sample = scene.samples[world, s]
+                if view.known:
+                    if bound_at(scene.solids, world, view, sample.point, lists) > lists:
+                        continue
                 d = solid_distance(scene.solids, world, solid, position_in_solid(pose, sample.point))
                 if d.value <= reach:
                     facing = facing_area(pose, sample, solid_normal(d.gradient))
@@ -335,18 +354,18 @@ class Coming:
     Attributes:
         met: When.
         lasts: Whether its contact lasts: it has no impact.
-        alone: Whether one of the bodies is fixed.
-        waits: Whether impulses may wait until the bodies meet.
+        alone: Whether one of the bodies is fixed: impulses may wait until they meet.
         rest: What it rests on when the step begins.
         support: Impulse of that, see `FoundPair.support`.
+        some: `NearPair.some` from then on.
     """
 
     met: Meeting
     lasts: bool
     alone: bool
-    waits: bool
     rest: Rest
     support: vec6
+    some: int
 
 
 @wp.func
@@ -372,11 +391,10 @@ def coming_of(
     slow = pair.h * material.bounce
     limits = limits_of(pair.numbers.impact_depth, slow, slow, ZERO)
     coming = Coming()
-    if wp.static(not TREES):
-        coming.alone = scene.body_index[pair.first].row < 0 or scene.body_index[pair.second].row < 0
-        if coming.alone:
-            limits.since = -ONE
-    coming.waits = coming.alone
+    coming.some = pair.some
+    coming.alone = is_with_fixed(a, b)
+    if coming.alone:
+        limits.since = -ONE
     coming.lasts = material.instant == ZERO
     if not coming.lasts:
         coming.met = meeting(scene, room, world, lane, pair, falling(a, 1), falling(b, 1), limits)
@@ -399,23 +417,23 @@ def coming_of(
                 found.support = coming.support
                 seen, other = as_they_meet(a, b, found, pair.h)
                 limits.sink = depth_beside(coming.rest, pair.numbers.impact_depth)
-                coming.met = meeting(scene, room, world, lane, pair, seen, other, limits)
+                again = pair
+                again.some = candidates_of_pair(scene, room, world, pair, a, b, seen, other)
+                coming.some = again.some
+                coming.met = meeting(scene, room, world, lane, again, seen, other, limits)
     return coming
 
 
 @wp.func
-def impact_of(
-    a: BodyState, b: BodyState, material: Material, found: FoundPair, pair: NearPair, coming: Coming
-) -> Impact:
+def impact_of(a: BodyState, b: BodyState, material: Material, found: FoundPair, pair: NearPair) -> Impact:
     """The impact of a pair with a patch, in place of none; still none where it approaches slowly.
 
     Args:
         a: First body.
         b: Second body.
         material: Of the contact.
-        found: What is found of the pair.
+        found: What is found of the pair; its impulses wait if it says so.
         pair: The pair.
-        coming: How it comes to meet.
     """
     impact = found.impact
     if found.patch.load > ZERO:
@@ -423,11 +441,29 @@ def impact_of(
         if impact.share > ZERO and found.hits > 0:
             factor = pair.numbers.factor
             impact.stiffness = stiffness_of_impact(a, b, found.patch, material.bounce, factor, pair.h)
-            impact = delayed(impact, wp.where(coming.waits, impact.share, ZERO), found.share, pair.h)
+            impact = delayed(impact, wp.where(found.waits > 0, impact.share, ZERO), found.share, pair.h)
             impact.rests = left_out(found, factor)
-            if coming.alone:
+            if is_with_fixed(a, b):
                 impact.turns = turning_after(a, b, found.patch, material.friction, found.share, pair.turning)
     return impact
+
+
+@wp.func
+def candidates_of_pair(
+    scene: wp.ref[Scene],
+    room: wp.ref[Room],
+    world: int,
+    pair: NearPair,
+    a: BodyState,
+    b: BodyState,
+    supported: BodyState,
+    other: BodyState,
+) -> int:
+    """`find_candidates_of_pair` for two bodies, and for what they are when others support them."""
+    body = scene.bodies[world, pair.first]
+    lever = wp.length(middle_of(body, a) - a.position) + body.radius
+    gain = wp.max(gain_of(a, b, lever), gain_of(supported, other, lever))
+    return find_candidates_of_pair(scene, room, world, pair, a, b, gain)
 
 
 @wp.func
@@ -446,6 +482,9 @@ def find_pair(
     numbers = pair.numbers
     a = room.bodies[world, pair.first]
     b = room.bodies[world, pair.second]
+    pair.some = candidates_of_pair(scene, room, world, pair, a, b, a, b)
+    if pair.some == 0:
+        return at
     material = scene.materials[world, pair.contact]
     coming = coming_of(scene, room, world, lane, pair, a, b)
     met = coming.met
@@ -464,6 +503,8 @@ def find_pair(
         found.falls = wp.where(not lasts and met.nears, 1, 0)
         if lasts or not met.nears:
             found.support = vec6()
+        # What was far enough to meet nothing from now on may have been near before.
+        pair.some = wp.where(met.share < ZERO, -1, coming.some)
         found.critical = met.critical
         found.share = met.share
         moment = Moment()
@@ -478,7 +519,9 @@ def find_pair(
         found.patch = listed.patch
         found.impact = no_impact(numbers.impact_depth, numbers.factor, numbers.deepest, pair.h)
         if not lasts:
-            found.impact = impact_of(seen, other, material, found, pair, coming)
+            found.waits = wp.where(coming.alone, 1, 0)
+            found.impact = impact_of(seen, other, material, found, pair)
+        found.waits = wp.where(found.impact.delays > ZERO, 1, 0)
         if not lasts and found.impact.share == ZERO:
             lasts = True
             before = met.share

@@ -89,7 +89,7 @@ def settle(
         fit_patch_duals(scene, room, world, lane, n_found)
     wait()
     trial = Trial()
-    trial.softness = ONE
+    trial.friction = ONE
     fit = assemble(scene, room, world, lane, n_found, trial, EVERYWHERE)
     if wp.static(PATCHES):
         add_patches(scene, room, world, lane, n_found, trial, fit)

@@ -9,11 +9,10 @@ settled. A solve ends when the residual is small and λ and s fit the velocities
 that of the law, too.
 
 Full steps can cycle. A solve that has not converged within a few passes takes shares of steps, smaller after
-each step that made the residual larger; then it goes on with a line search, then from softer friction in
-levels. Where that cycles, too, friction mostly presses a point in, which raises its friction. Then the
-bounds b are held: the equations are those of a convex function, and a line search finds their root. The
-bounds are renewed by halves until they fit, and the solve goes on with the law as it is. What does not
-converge ends where its residual was smallest.
+each step that made the residual larger. Where that cycles, too, friction mostly presses a point in, which
+raises its friction. Then the solve begins again, from rest and almost without friction: the equations are
+nearly those of a convex function, and a line search finds their root. Friction grows to what it is in levels,
+each from the root of the one before. What does not converge ends where its residual was smallest.
 """
 
 import warp as wp
@@ -48,24 +47,20 @@ from dano.engine.kernels.trees.balance import (
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.real import HALF, INFINITY, ONE, real, TWO, vec6, ZERO
 
-LEVELS = 11
+LEVELS = 9
 """Number of levels of a solve."""
 _LEVELS, _LANES = wp.constant(LEVELS), wp.constant(LANES)
 # In the first level steps are whole for so many passes, then shares that grow and shrink by these factors and
 # are no less than the last: on recorded piles of 8 to 64 bodies half the passes of fixed shares, or as many.
 _WHOLE = wp.constant(4)
 _GROWS, _SHRINKS, _LEAST = wp.constant(real(1.1)), wp.constant(real(0.8)), wp.constant(real(0.2))
-# Residual to which soft levels are solved, over the softened stiction velocity [m/s].
-_SOFT_TOLERANCE = wp.constant(real(1e-3))
-# Share of the held friction bounds that is renewed at once, and change that ends it, over all pressure.
-_MIX, _RENEWED = wp.constant(real(0.5)), wp.constant(real(1e-6))
+# Residual to which levels with less friction are solved [m/s].
+_ROUGH = wp.constant(real(1e-4))
 # A step is accepted when what the residual does along it fell to this share; when the bracket around the zero
 # of that is narrower than this share of the step, it is accepted as it is.
 _ENOUGH, _GIVE_UP = wp.constant(real(0.5)), wp.constant(real(0.01))
 # Residual over the rounding of velocities beside which nothing is left to take.
 _EXACT = wp.constant(real(4.0))
-# Stiction velocity that levels are multiples of [m/s].
-_STICTION = wp.constant(real(1e-7))
 
 
 @wp.struct
@@ -83,11 +78,11 @@ class Options:
 class Level:
     """How a level of a solve is solved."""
 
-    softness: real  # Multiplies the stiction velocity
+    friction: real  # Share of the friction that there is
     share: real  # Of a step that is taken
     searches: bool  # Whether a line search runs
+    begins: bool  # Whether it begins from rest
     budget: int  # Passes
-    holds: bool  # Whether friction bounds are held
 
 
 @wp.struct
@@ -122,27 +117,25 @@ class Solved:
 
 @wp.func
 def level_of(number: int) -> Level:
-    """Friction as it is; with a line search; softer and softer; hard again; held; hard; short steps."""
+    """Friction as it is; from rest, almost none, then more and more; as it is; short steps."""
     level = Level()
-    level.softness = ONE
+    level.friction = ONE
     level.share = ONE
     level.searches = True
-    level.budget = 30
-    level.holds = False
+    level.begins = number == 1
+    level.budget = 100
     if number == 0:
         level.searches = False
-        level.budget = 100
-    elif number >= 2 and number <= 6:
-        level.softness = wp.pow(real(10.0), real(7 - number))
-        level.budget = 8
+    elif number == 1:
+        level.friction = real(0.01)
+        level.budget = 80
+    elif number < 7:
+        level.friction = real(0.1) + real(0.2) * real(number - 2)
+        level.budget = 25
     elif number == 8:
-        level.softness = real(100.0)
-        level.budget = 150
-        level.holds = True
-    elif number >= 10:
         level.share = real(0.4)
         level.searches = False
-        level.budget = 100
+        level.budget = 75
     return level
 
 
@@ -258,6 +251,24 @@ def newton_step(scene: Scene, room: Room, world: int, lane: int, share: real, ke
 
 
 @wp.func(inline=True)
+def begin(scene: Scene, room: Room, world: int, lane: int, n_found: int, island: int, rests: bool):
+    """Begin from the velocities of an island as they are, or from rest, with duals that fit."""
+    part = part_of(scene, room, world, n_found, island)
+    if lane == 0:
+        for e in range(part.first, part.end):
+            i = member(room, world, island, e)
+            if rests:
+                room.velocity[world, i] = vec6()
+            room.step[world, i] = vec6()
+        if wp.static(TREES):
+            fit_joint_duals(scene, room, world)
+    wait()
+    fit_duals(scene, room, world, lane, n_found, island)
+    if wp.static(PATCHES):
+        fit_patch_duals(scene, room, world, lane, n_found)
+
+
+@wp.func(inline=True)
 def solve_island(
     scene: Scene, room: Room, world: int, lane: int, n_found: int, size: real, options: Options, island: int
 ) -> Solved:
@@ -278,14 +289,10 @@ def solve_island(
         for e in range(places.first, places.end):
             i = member(room, world, island, e)
             room.best[world, i] = room.velocity[world, i]
-            room.step[world, i] = vec6()
-        if wp.static(TREES):
-            fit_joint_duals(scene, room, world)
-    fit_duals(scene, room, world, lane, n_found, island)
+    begin(scene, room, world, lane, n_found, island, False)
     n_near = n_found
     if wp.static(PATCHES):
         n_near += room.patches.count[world, 0]
-        fit_patch_duals(scene, room, world, lane, n_found)
     found = Solved()
     search = begin_search(ZERO)
     number = int(0)
@@ -303,7 +310,6 @@ def solve_island(
                 # Smooth friction is a function: whole steps know no more than a line search.
                 number = 1
                 level.searches = True
-    mix = real(0.0)
     share = real(1.0)
     before = real(INFINITY)
     best = real(INFINITY)
@@ -320,9 +326,7 @@ def solve_island(
         wait()
         trial = Trial()
         trial.length = search.length
-        trial.softness = level.softness
-        trial.holds = level.holds
-        trial.mix = mix
+        trial.friction = level.friction
         fit = assemble(scene, room, world, lane, n_found, trial, island)
         if wp.static(PATCHES):
             fit = add_patches(scene, room, world, lane, n_found, trial, fit)
@@ -346,20 +350,20 @@ def solve_island(
             wait()
         seen = measure(scene, room, world, lane, island)
         # Far from a root everything is large, what rounding leaves there, too.
-        rounded = wp.min(real(16.0) * options.rounding * seen.size, options.fit * (ONE + size))
+        rounded = wp.min(real(64.0) * options.rounding * seen.size, options.fit * (ONE + size))
         tolerance = wp.max(options.tolerance * (ONE + size), rounded)
-        hard = level.softness == ONE
+        whole = level.friction == ONE
         enough = tolerance
-        if not hard:
-            enough = wp.max(tolerance, _SOFT_TOLERANCE * _STICTION * level.softness)
+        if not whole:
+            enough = wp.max(tolerance, _ROUGH)
         small = seen.error <= enough
         if found.passes == 0 and not (seen.error < INFINITY):
             # What is not finite at the velocities that a solve begins with is not finite anywhere.
             number = _LEVELS
         accept = small or not level.searches or accepts(search, seen.work)
         # Where rounding keeps duals from fitting, a second small residual has to do.
-        found.converged = small and hard and (fit.unfit <= options.fit * fit.push or before <= enough)
-        improves = hard and seen.error < best
+        found.converged = small and whole and (fit.unfit <= options.fit * fit.push or before <= enough)
+        improves = whole and seen.error < best
         if improves:
             best = seen.error
         # Once the residual falls as it should, there is nothing to be damped.
@@ -372,27 +376,24 @@ def solve_island(
         part = level.share * share
         if seen.error < HALF * before:
             part = ONE
-        spent = budget <= 0
-        settled = (
-            not level.holds or spent or (mix > ZERO and mix < ONE and fit.renewed <= _RENEWED * fit.push)
-        )
-        harder = accept and ((small and not hard and settled) or (not small and spent))
+        goes_on = accept and ((small and not whole) or (not small and budget <= 0))
         budget -= 1
-        mix = ZERO
-        if accept and small and level.holds:
-            mix = _MIX
-        if harder:
+        if goes_on:
             number += 1
             level = level_of(number)
             budget = level.budget
-            if level.holds:
-                mix = ONE
+            # No step: the next pass has other friction.
+            part = ZERO
         wait()
         if not accept:
             search = narrowed(search, seen.work)
-        else:
-            if lane == 0:
-                copy_rows(room, world, places, island, room.tried, room.velocity)
+        elif lane == 0:
+            copy_rows(room, world, places, island, room.tried, room.velocity)
+        if goes_on and level.begins:
+            begin(scene, room, world, lane, n_found, island, True)
+            search = begin_search(ZERO)
+            before = real(INFINITY)
+        elif accept:
             if wp.static(TREES):
                 if n_near == 0 and found.converged and seen.error > _EXACT * options.rounding * (ONE + size):
                     # A last step, not looked at, takes what is left to rounding.
@@ -408,14 +409,12 @@ def solve_island(
                 follow_duals(scene, room, world, lane, n_found, search.length, island)
                 if wp.static(PATCHES):
                     follow_patch_duals(scene, room, world, lane, n_found)
-                # The next pass is no longer of the same function where bounds are renewed: it is accepted.
                 begun = real(0.0)
-                if mix == ZERO:
-                    if wp.static(TREES):
-                        begun = measure_joints(scene, room, world).work
-                    for e in range(places.first, places.end):
-                        i = member(room, world, island, e)
-                        begun += wp.dot(room.step[world, i], room.residual[world, i])
+                if wp.static(TREES):
+                    begun = measure_joints(scene, room, world).work
+                for e in range(places.first, places.end):
+                    i = member(room, world, island, e)
+                    begun += wp.dot(room.step[world, i], room.residual[world, i])
                 search = begin_search(begun)
             before = seen.error
         if improves and lane == 0:

@@ -23,8 +23,8 @@ from dano.physics.trees.loops import Loop
 
 BLOCK = 16
 """Samples of a block."""
-RUN = 4
-"""Blocks that the search looks at together first."""
+RUN, LEVELS = 4, 3
+"""Blocks that the search looks at together: 4, 16 and 64, the most first."""
 
 
 @wp.struct
@@ -97,7 +97,8 @@ class Scene:
         samples: Of all bodies, in blocks, shape (worlds, samples).
         balls: Centre [m, F] and radius [m] of a ball around each block, shape (worlds, blocks).
         slabs: Mean unit normal [F] of each block, and how far along it samples are from its centre [m].
-        runs: Balls around each block and those after it, `RUN` in all.
+        runs: Balls around blocks of a body that follow each other. Beside its k-th block, for k a multiple of
+            `RUN`, that around `RUN` of them; beside the next, for k a multiple of `RUN`², around `RUN`²; ….
         solids: What samples press on.
         n_pressing: Pairs with samples that press.
         pairs: Of pairs that differ, shape (worlds, kinds of pairs).
@@ -210,6 +211,7 @@ class FoundPair:
     hits: wp.int32  # 1 where τ is when the bodies are as deep as in an impact
     falls: wp.int32  # 1 where both fall freely until they meet: then gravity takes part in their way
     waits: wp.int32  # 1 where impulses of an impact take effect when the bodies meet
+    other: wp.int32  # 1 or −1 where the next pair or the one before is the other side of its impact, else 0
     impact: Impact  # Of the pair
     patch: Patch  # Its samples that have sunk in
     rest: Rest  # Samples that it rests on when the step begins, where it has an impact, too
@@ -329,6 +331,8 @@ class Room:
         linear: The law as it was linearised last.
         near: Blocks whose samples may meet a solid within the step, of each lane a part.
         until: Share of the step before which none of such a block does.
+        some: Blocks of the pair that is looked at that may be near.
+        bound: Beneath the clearance of their samples when the step begins [m].
         blocks: Of the Jacobian, those that are not zero, row by row, shape (worlds, blocks · blocks + 1).
         spare: The same, used up by the solve.
         used: Of each row and column the place of its block, from 1 on, or 0.
@@ -392,6 +396,8 @@ class Room:
     linear: wp.array2d(dtype=Linear)
     near: wp.array2d(dtype=wp.int32)
     until: wp.array2d(dtype=real)
+    some: wp.array2d(dtype=wp.int32)
+    bound: wp.array2d(dtype=real)
     blocks: wp.array2d(dtype=mat66)
     spare: wp.array2d(dtype=mat66)
     used: wp.array2d(dtype=wp.int32)

@@ -14,10 +14,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.interpreters import mlir
 
-from dano.engine.launching._arguments import given_arrays, parameters_of
-from dano.engine.launching._ffi import Call, register
-from dano.engine.launching._plans import Build, LaunchPlan
+from dano.engine.launching._launch import (
+    Build,
+    Call,
+    given_arrays,
+    launch_p,
+    LaunchPlan,
+    lowered_by,
+    parameters_of,
+    register,
+)
 
 LANES = 32
 """Lanes of a world: those of a warp."""
@@ -64,6 +72,9 @@ def call(
         input_output_aliases={first + k: k for k in range(len(zeros))},
     )(*inputs, *whole, *zeros)
     return found[:-1]
+
+
+mlir.register_lowering(launch_p, lowered_by(call), platform="cuda")
 
 
 def _layout(plan: LaunchPlan, build: Build) -> tuple[dict[str, tuple[int, int, int]], int]:

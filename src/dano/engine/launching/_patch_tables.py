@@ -105,8 +105,6 @@ def patch_tables(
     Raises:
         ValueError: If kernels do not know a law or a field, or a pair has nothing to sum over.
     """
-    if not pairs:
-        return PatchRows({}, {}, [], _integers([], 5), False)
     samples, fields = _Samples(dtype, twins), _Fields(dtype, n_leaves, twins)
     contacts, materials, sides, side_index, index = [], [], [], [], []
     for k, pair in enumerate(pairs):
@@ -213,7 +211,7 @@ class _Samples:
         return {
             "scene.patches.samples": jnp.concatenate([*joined, none]),
             "scene.patches.balls": jnp.concatenate([*balls, none]),
-            "scene.patches.runs": jnp.concatenate([*map(balls_around_runs, balls), none]),
+            "scene.patches.runs": jnp.concatenate([*(balls_around_runs(b, [len(b)]) for b in balls), none]),
         }
 
 

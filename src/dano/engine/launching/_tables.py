@@ -1,5 +1,6 @@
 """A scene as rows of numbers, as kernels read them (`dano.engine.kernels.tables`)."""
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,10 +11,9 @@ from jaxtyping import DTypeLike, Float, Int
 
 from dano import native
 from dano.contact import AbstractPatchLaw, ContactParams, DistributedLaw, Materials, materials, SurfaceSet
-from dano.engine.joints import structure_of_trees, tree_rows, TreeStructure
-from dano.engine.launching._builds import build_for
+from dano.engine._joints import structure_of_trees, tree_rows, TreeStructure
+from dano.engine.launching._launch import WholeNumbers
 from dano.engine.launching._patch_tables import knows_law, patch_pairs, patch_tables, PatchRows
-from dano.engine.launching._plans import WholeNumbers
 from dano.maths import AnyArray, is_traced, library
 from dano.scene import Body, pressing_pairs, Scene
 
@@ -227,18 +227,20 @@ def _materials(
 def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
     """Samples, and balls around blocks and runs of them, of all bodies; where each body's stand."""
     sampled = scene.sampled or scene.twins or tuple(range(len(bodies)))
-    empty = SurfaceSet.none(dtype)
     first: dict[int, tuple[int, int]] = {}
     sets: list[SurfaceSet] = []
     index, blocks = [], 0
     for i, body in enumerate(bodies):
-        surface = empty if body.surface is None else body.surface
-        key = -1 if body.surface is None else sampled[i]
-        if key not in first:
-            first[key] = blocks, surface.radii.shape[0]
+        surface = body.surface
+        if surface is None:
+            index.append((0, 0, _TURNING["fixed"]))
+            continue
+        if sampled[i] not in first:
+            first[sampled[i]] = blocks, surface.radii.shape[0]
             sets.append(surface)
             blocks += surface.radii.shape[0]
-        index.append((*first[key], _TURNING[surface.turning]))
+        index.append((*first[sampled[i]], _TURNING[surface.turning]))
+    sets = sets or [SurfaceSet.none(dtype)]
     xp = library(*jax.tree.leaves(sets))
     points_of = xp.concatenate([s.points[:3].T for s in sets]).astype(dtype)
     vectors = xp.concatenate([s.vectors.T for s in sets]).astype(dtype)
@@ -249,7 +251,7 @@ def _surfaces(scene: Scene, bodies: Sequence[Body], dtype: DTypeLike):
         "scene.samples": xp.concatenate([points_of, vectors], axis=1),
         "scene.balls": balls,
         "scene.slabs": native.slabs_of_blocks(points_of, vectors, centers),
-        "scene.runs": native.balls_around_runs(balls),
+        "scene.runs": native.balls_around_runs(balls, [s.radii.shape[0] for s in sets]),
     }
     return rows, index
 
@@ -277,6 +279,8 @@ def _solids(
 
 def _patches(scene: Scene, n_pairs: int, n_leaves: int) -> PatchRows:
     """Contacts with a patch law, behind pairs and leaves of the others."""
+    if all(contact.law.presses for contact in scene.contacts):
+        return PatchRows({}, {}, [], np.zeros((0, 5), np.int32), False)
     twins = scene.twins or tuple(range(len(scene.bodies)))
     pairs = patch_pairs(scene)
     return patch_tables(pairs, scene.timestep.dtype, n_pairs=n_pairs, n_leaves=n_leaves, twins=twins)
@@ -417,3 +421,67 @@ def _pairs(
         margin=_MARGIN * size + 2 * gravity_step.astype(dtype),
         damper=(_HARDEST_SAMPLE * common / h).astype(dtype),
     )
+
+
+_FORWARD = ("rollout", "touch", "listing")
+_DERIVATIVES = ("derivatives.pullback", "derivatives.pushforward")
+
+
+@functools.cache
+def builds() -> tuple[native.Features, ...]:
+    """Builds of kernels that serve all scenes, from the smallest on.
+
+    Each takes minutes to compile, so they are few: what is left out of one has to make it much smaller or
+    faster. A plane knows no shapes; shapes know no splines; bodies that move freely no trees.
+    """
+    plane, grid, density = map(native.kind_number, ("half_space", "grid", "density"))
+    shapes = native.shape_kinds()
+    everything = frozenset({*shapes, grid, density})
+    sets = (
+        # kinds of leaves, contacts with a patch law, bodies on joints
+        (frozenset({plane}), False, False),
+        (frozenset({plane}), True, False),
+        (shapes, False, False),
+        (everything, False, False),
+        (everything, True, False),
+        (shapes, False, True),
+        (everything, False, True),
+        (everything, True, True),
+    )
+    return tuple(
+        native.Features(
+            ADJOINTS=False,
+            LAW="",
+            KINDS=kinds,
+            DEGREES=frozenset({1, 2, 3}) if grid in kinds else frozenset(),
+            UNIONS=len(kinds) > 1,
+            PATCHES=patches,
+            TREES=trees,
+        )
+        for kinds, patches, trees in sets
+    )
+
+
+def build_for(kinds: set[int], *, law: str, unions: bool, patches: bool, trees: bool) -> native.Features:
+    """The smallest build that knows what a scene needs.
+
+    Args:
+        kinds: Of leaves.
+        law: File of functions of its point contacts, empty for the usual ones.
+        unions: Whether a solid or a density has several leaves.
+        patches: Whether there are contacts with a patch law.
+        trees: Whether bodies hang on joints.
+    """
+    needed = {"UNIONS": unions, "PATCHES": patches, "TREES": trees}
+    for each in builds():
+        values = dict(each.values)
+        if kinds <= values["KINDS"] and all(values[name] >= need for name, need in needed.items()):
+            return each.but(LAW=law)
+    raise AssertionError(f"no build knows {kinds}, {needed}")
+
+
+def kernel_builds() -> list[tuple[native.Features, str]]:
+    """Features and modules of all kernels that scenes without a law of their own ask for."""
+    forward = [(each, name) for each in builds() for name in _FORWARD]
+    derivatives = [(each.but(ADJOINTS=True), name) for each in builds() for name in _DERIVATIVES]
+    return [(each, f"dano.engine.kernels.{name}") for each, name in (*forward, *derivatives)]

@@ -6,7 +6,7 @@ from dano.engine.kernels.assembly import presses
 from dano.engine.kernels.impacts import apart_at_start, support_before, support_on_way
 from dano.engine.kernels.lanes import total, total_of
 from dano.engine.kernels.near import as_they_meet, facing, left_out, near_pair, NearPair, solid_of_body
-from dano.engine.kernels.search import Coming, impact_of
+from dano.engine.kernels.search import impact_of
 from dano.engine.kernels.tables import FoundPair, Room, SamplePair, Scene
 from dano.physics.features import KINDS, LANES, TREES, UNIONS
 from dano.physics.friction import friction_near, Slip
@@ -307,9 +307,7 @@ def pull_samples(
 ) -> tuple[Touching, Virtual]:
     """Derivatives by what the samples of a pair depend on, of all lanes; adds those by samples and solids.
 
-    Those by twists are only there with bodies on joints.
-
-    `what` is asked of them, see `PRESSES`.
+    Those by twists are only there with bodies on joints. `what` is asked of samples, see `PRESSES`.
     """
     second = scene.pair_index[found.pair].second
     bar = Touching()
@@ -582,10 +580,9 @@ def pull_pair(
     near = near_pair(scene, world, found.pair)
     a, b = as_they_meet(room.bodies[world, near.first], room.bodies[world, near.second], found, near.h)
     at = met_pair(scene, world, near, a, b, found.share, found.toward)
-    material = scene.materials[world, near.contact]
     samples = touching_of(scene, world, found, near, at)
-    restores = wp.where(material.instant > ZERO, rebound, ONE)
-    samples.material.restitution = restores * material.restitution
+    restores = wp.where(samples.material.instant > ZERO, rebound, ONE)
+    samples.material.restitution = restores * samples.material.restitution
     asked = Asked()
     by, by_twists = pull_samples(scene, room, world, lane, PRESSES, found, samples, twists, asked)
     by.material.restitution = restores * by.material.restitution
@@ -598,17 +595,14 @@ def pull_pair(
     bar.timestep = by_h
     support_bar = vec6()
     if found.impact.share > ZERO:
-        coming = Coming()
-        coming.waits = found.impact.delays > ZERO
         if wp.static(not TREES):
-            coming.alone = scene.body_index[near.first].row < 0 or scene.body_index[near.second].row < 0
             if found.impact.stiffness > ZERO:
                 by_met = pull_waiting(scene, room, world, found, twists, waiting, takes, bar)
                 by.impact.delays += by_met.impact.delays
                 by.share += by_met.share
                 support_bar = by_met.support
-        by_first, by_second, by_material, by_found, by_near, _b, _c = wp.grad(impact_work)(
-            a, b, material, found, near, coming, by.impact
+        by_first, by_second, by_material, by_found, by_near, _b = wp.grad(impact_work)(
+            a, b, samples.material, found, near, by.impact
         )
         asked.patch = by_found.patch
         of_patch, _d = pull_samples(scene, room, world, lane, MEETS, found, samples, twists, asked)
@@ -640,7 +634,6 @@ def pull_pair(
     if wp.static(not TREES):
         if wp.length_sq(found.support) > ZERO:
             bar = pull_support(scene, room, world, lane, found, support_bar, by.rests, depth_bar, bar)
-    if lane == 0:
-        bar.first = falling_bar(bar.first, found.falls)
-        bar.second = falling_bar(bar.second, found.falls)
+    bar.first = falling_bar(bar.first, found.falls)
+    bar.second = falling_bar(bar.second, found.falls)
     return bar, by_twists

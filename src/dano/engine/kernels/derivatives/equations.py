@@ -25,7 +25,7 @@ from dano.engine.kernels.tables import FoundPair, Room, Scene
 from dano.engine.kernels.trees.balance import clear_trees, eliminate_joint_duals, solve_trees
 from dano.physics.features import LANES, PATCHES, TREES
 from dano.physics.pairs import BodyState
-from dano.physics.real import HALF, ONE, real, vec6, ZERO
+from dano.physics.real import HALF, ONE, vec6, ZERO
 from dano.physics.structures import after_adjoints, product_of
 
 _LANES = wp.constant(LANES)
@@ -157,19 +157,6 @@ def is_moved_pair(twists: Virtual) -> bool:
 
 
 @wp.func
-def waits_too(scene: wp.ref[Scene], room: wp.ref[Room], world: int, entry: int, other: int, end: int) -> bool:
-    """Whether another entry is the other side of a pair that waits, and waits, too."""
-    if (
-        other < 0
-        or other >= end * _LANES
-        or room.found[world, entry].waits * room.found[world, other].waits == 0
-    ):
-        return False
-    index = scene.pair_index[room.found[world, entry].pair]
-    return scene.pair_index[room.found[world, other].pair].first == index.second
-
-
-@wp.func
 def waiting_bars(scene: wp.ref[Scene], room: wp.ref[Room], world: int, found: FoundPair) -> Waiting:
     """A pair's part of derivatives by when impulses on its bodies take effect, and by what carries them."""
     bars = Waiting()
@@ -215,21 +202,19 @@ def pull_equations(scene: wp.ref[Scene], room: wp.ref[Room], launch: wp.ref[Laun
         stage = k // step.n_found
         entry = (k % step.n_found) * _LANES + lane
         found = room.found[world, entry]
-        again = waits_too(scene, room, world, entry, entry + _LANES, step.n_found)
+        both_wait = found.waits * room.found[world, entry + found.other * _LANES].waits > 0
+        again = both_wait and found.other > 0
         if (found.waits > 0) == (stage > 0) and (stage < 2 or again):
             twists = twists_of_pair(scene, room, world, entry)
             waiting = waiting_bars(scene, room, world, found)
-            takes = real(1.0)
-            if waits_too(scene, room, world, entry, entry - _LANES, step.n_found):
-                takes = HALF
+            takes = wp.where(both_wait and found.other < 0, HALF, ONE)
             if again:
                 takes = ZERO
-                met = waiting.met
-                waiting.met = ZERO
+                met = wp.where(stage == 2, waiting.met, ZERO)
                 if stage == 2:
                     twists = Virtual()
                     waiting = Waiting()
-                    waiting.met = met
+                waiting.met = met
             if is_moved_pair(twists) or not (waiting_product(waiting, waiting) == ZERO):
                 rebound = launch.reports[world, step.t].rebound
                 bar, by_twists = pull_pair(scene, room, world, lane, found, rebound, twists, waiting, takes)

@@ -212,10 +212,8 @@ def pull_patch(
         )
         bar = by_twists
     wait()
-    s = int(contact.first_side)
-    while s < contact.first_side + contact.sides:
-        if scene.patches.side_index[s].ball < 0 and room.patches.sums[world, s].share > ZERO:
-            pull_side(scene, room, world, lane, s)
-        s += 1
+    for side in range(contact.first_side, contact.first_side + contact.sides):
+        if scene.patches.side_index[side].ball < 0 and room.patches.sums[world, side].share > ZERO:
+            pull_side(scene, room, world, lane, side)
     wait()
     return bar

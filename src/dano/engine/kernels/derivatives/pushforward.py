@@ -120,26 +120,23 @@ def push_equations(
     if lane == 0:
         for i in range(launch.n_directions * m):
             room.missing[world, i] = vec6()
-    block = int(0)
-    k = int(0)
-    while block < m:
-        clear_bars(scene, room, ends, world, lane)
-        if lane == 0:
-            room.step[world, block][k] = ONE
-        wait()
-        pull_equations(scene, room, launch, step)
-        change_along(scene, room, launch, ends, step)
-        if lane == 0:
-            for d in range(launch.n_directions):
-                room.missing[world, d * m + block][k] = room.along[world, d]
-        wait()
-        k += 1
+    for unknown in range(6 * m):
+        block = unknown // 6
+        k = unknown % 6
         used = int(6)
         if wp.static(TREES):
             used = scene.trees.blocks[block].used
-        if k >= used:
-            block += 1
-            k = 0
+        if k < used:
+            clear_bars(scene, room, ends, world, lane)
+            if lane == 0:
+                room.step[world, block][k] = ONE
+            wait()
+            pull_equations(scene, room, launch, step)
+            change_along(scene, room, launch, ends, step)
+            if lane == 0:
+                for d in range(launch.n_directions):
+                    room.missing[world, d * m + block][k] = room.along[world, d]
+            wait()
     for d in range(launch.n_directions):
         if lane == 0:
             for b in range(m):
@@ -177,8 +174,7 @@ def push_end(
         if lane == 0:
             follow_chains(scene, room, world)
         wait()
-    number = int(0)
-    while number < n:
+    for number in range(n):
         i = number // 13
         moves = bool(True)
         if i < scene.body_index.shape[0]:
@@ -202,7 +198,6 @@ def push_end(
                         change += wp.dot(room.residual[world, b], room.missing[world, d * m + b])
                 ends.ends[world, (d * launch.n_steps + step.t) * n + number] = change
         wait()
-        number += 1
 
 
 @wp.kernel(enable_backward=False)

@@ -221,12 +221,11 @@ def coordinate_work(
 def loop_end(chain: Chain, is_after: bool) -> LoopEnd:
     """An end of a loop at the start of a step, or at its end."""
     end = LoopEnd()
+    end.position = chain.position
+    end.orientation = chain.orientation
     if is_after:
         end.position = chain.position + chain.after.shift
         end.orientation = chain.after.turn * chain.orientation
-    else:
-        end.position = chain.position
-        end.orientation = chain.orientation
     return end
 
 

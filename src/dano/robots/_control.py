@@ -1,19 +1,27 @@
-"""Servo control of a robot's joints, in scenes that hold other things, too."""
+"""Control of a robot's joints, and of a link in the space in which its task is told."""
 
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dano.checks import checked_kind, checked_number, shown
-from dano.maths import checked_array, is_traced, Numbers
+from dano.maths import checked_array, checked_floating, is_traced, Numbers
 from dano.names import did_you_mean
-from dano.robots._dynamics import gravity_forces, joint_control, mass_matrix
-from dano.robots._robot import Robot
+from dano.robots._dynamics import (
+    bias_forces,
+    drifted,
+    generalised_velocities,
+    gravity_forces,
+    joint_control,
+    mass_matrix,
+)
+from dano.robots._robot import check_arguments, Robot
 from dano.scene import Control, Scene, State
 
 Goal = Mapping[str, Numbers] | Numbers
@@ -178,3 +186,59 @@ def _check_reach(scene: Scene, robot: Robot, names: tuple[str, ...], goal: Float
                 f"goal of joint {name!r} must lie in its limits [{low:.4g}, {high:.4g}],"
                 f" got {float(value):.4g}"
             )
+
+
+def operational_space_torque(
+    robot: Robot,
+    scene: Scene,
+    state: State,
+    link: str,
+    acceleration: Numbers,
+    *,
+    posture: Numbers | None = None,
+    softness: float = 1e-9,
+) -> Float[Array, " k"]:
+    """Generalised forces that give a link an acceleration (Khatib 1987, A unified approach …, eq. 51).
+
+    With J of the link and M(q) v̇ + b(q, v) = τ,
+
+        τ = Jᵀ Λ (a − J̇ v) + b + (1 − Jᵀ Λ J M⁻¹) τ₀,        Λ = (J M⁻¹ Jᵀ)⁻¹,
+
+    so that what the task leaves free follows τ₀, which does not disturb it.
+
+    Args:
+        robot: The robot.
+        scene: A scene with it.
+        state: Where it is and how it moves.
+        link: Name in the file.
+        acceleration: a of the link's frame: linear [m/s², W], shape (3,), or linear and angular [rad/s², W],
+            shape (6,).
+        posture: τ₀ [N, N m], shape (k,). Default: none.
+        softness: Share of the mean of J M⁻¹ Jᵀ that is added to it, so that torques stay finite where the
+            link cannot move in some direction.
+
+    Raises:
+        ValueError: If the link is unknown, a shape is wrong, or `softness` < 0.
+    """
+    check_arguments(robot, scene, state)
+    dtype, k = scene.timestep.dtype, scene.layout.n_velocities
+    wanted = checked_floating("acceleration", acceleration)
+    if wanted.shape not in ((3,), (6,)):
+        raise ValueError(f"acceleration must have shape (3,) or (6,), got {wanted.shape}")
+    wanted = checked_array("acceleration", wanted, wanted.shape).astype(dtype)
+    free = jnp.zeros(k) if posture is None else checked_array("posture", posture, (k,))
+    free = free.astype(dtype)
+    checked_number("softness", softness, least=0)
+    n, speeds = wanted.shape[0], generalised_velocities(scene, state)
+    jacobian = robot.place(scene, state, link)[2][:n]
+
+    def moved(share: Float[Array, ""]) -> Float[Array, " n"]:
+        return robot.place(scene, drifted(scene, state, share), link)[2][:n] @ speeds
+
+    zero, one = jnp.zeros((), dtype), jnp.ones((), dtype)
+    _, drift = jax.jvp(moved, (zero,), (one,))
+    follows = jnp.linalg.solve(mass_matrix(scene, state), jacobian.T)
+    mobility = jacobian @ follows
+    softer = mobility + softness * jnp.trace(mobility) / n * jnp.eye(n, dtype=dtype)
+    force = jnp.linalg.solve(softer, wanted - drift - follows.T @ free)
+    return jacobian.T @ force + bias_forces(scene, state) + free

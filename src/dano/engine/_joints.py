@@ -1,8 +1,9 @@
-"""Kinematic trees and loops of a scene, in integers for kernels: nodes, unknowns, blocks, loops.
+"""Bodies on joints as tables for kernels: kinematic trees and loops in integers, then rows of real numbers.
 
 The unknowns of a step stand in blocks of six. A body that moves freely has a block. The joint coordinates of
 its tree follow in blocks of their own, parents before children; places that are left over are padding. Last
 come the forces in loops.
+Rows are those that `dano.engine.kernels.trees.tables` reads.
 """
 
 import functools
@@ -10,9 +11,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
-from dano.scene import StateLayout
+from dano.maths import AnyArray, library
+from dano.scene import JointLaws, Scene, StateLayout
 
 _SIX = 6
 _WELD = 6
@@ -227,3 +229,86 @@ def _elimination(nodes: _Nodes, places: dict[int, int], size: int):
 
 def _table(rows, width: int) -> Int[np.ndarray, "n k"]:
     return np.array([tuple(map(int, row)) for row in rows], np.int32).reshape(-1, width)
+
+
+def structure_of_trees(scene: Scene, touching: Iterable[int]) -> TreeStructure:
+    """Kinematic trees and loops of a scene.
+
+    Args:
+        scene: The scene.
+        touching: Bodies that may touch something.
+    """
+    laws, closing = scene.chains.laws, scene.closing
+    loops = ()
+    if closing is not None:
+        ends = zip(closing.first, closing.second, strict=True)
+        loops = tuple((a, b, i in closing.welds) for i, (a, b) in enumerate(ends))
+    return tree_structure(scene.layout, laws.constant, laws.rough, frozenset(touching), loops)
+
+
+def tree_rows(
+    scene: Scene, structure: TreeStructure
+) -> tuple[dict[str, Float[AnyArray, "rows width"]], dict[str, Int[np.ndarray, "..."]]]:
+    """Real and whole numbers by place in a kernel's parameters."""
+    dtype, closing = scene.timestep.dtype, scene.closing
+    loops = np.zeros((0, 10), dtype)
+    if closing is not None:
+        of_loops = (closing.position, closing.anchor, closing.orientation)
+        loops = library(*of_loops).concatenate(of_loops, axis=1)
+    rows = {
+        "scene.trees.joints": scene.chains.table.astype(dtype),
+        "scene.trees.laws": _law_rows(scene.chains.laws, dtype),
+        "scene.trees.loops": loops.astype(dtype),
+    }
+    whole = {
+        "nodes": structure.nodes,
+        "coordinates": structure.coordinates,
+        "unknowns": structure.unknowns,
+        "order": structure.order,
+        "columns": structure.columns,
+        "blocks": structure.blocks,
+        "closed": structure.closed,
+        "loop_index": structure.loops,
+    }
+    return rows, {f"scene.trees.{name}": values for name, values in whole.items()}
+
+
+def tree_lengths(structure: TreeStructure) -> dict[str, int]:
+    """Lengths of the arrays in which a world works on its trees."""
+    m, unknowns = len(structure.moving), _SIX * structure.n_blocks
+    lengths = {
+        **dict.fromkeys(
+            ("frames", "displacements", "pivots", "twists", "offsets", "wrenches", "composites"), m
+        ),
+        **dict.fromkeys(("start", "end"), structure.motions),
+        **dict.fromkeys(("diagonal", "column", "spread", "impulses"), unknowns),
+        **dict.fromkeys(("lower", "upper"), structure.entries),
+        "columns": len(structure.columns),
+        **dict.fromkeys(("joints", "q", "v"), len(structure.coordinates)),
+        "turned": m,
+        "coupled": len(structure.closed),
+        "sizes": 4,
+    }
+    return {f"room.trees.{name}": length for name, length in lengths.items()}
+
+
+def _law_rows(laws: JointLaws, dtype) -> Float[AnyArray, "c 12"]:
+    """What acts on each joint coordinate, see `JointLaws`.
+
+    Damping, armature, stiffness, rest, friction, two limits and five numbers of a motor. What no joint has is
+    0, or endless.
+    """
+    none = np.zeros(laws.damping.shape, laws.damping.dtype)
+
+    def column(values: AnyArray | None) -> AnyArray:
+        return (none if values is None else values)[:, None]
+
+    endless = np.broadcast_to(np.array([-np.inf, np.inf]), (none.size, 2))
+    endless = endless.astype(dtype)
+    limits = endless if laws.limits is None else laws.limits
+    motor = laws.motor
+    if motor is None:
+        motor = np.concatenate([np.zeros((none.size, 3), dtype), endless], axis=1)
+    single = (laws.damping, laws.armature, laws.stiffness, laws.rest, laws.friction)
+    columns = [*(column(x) for x in single), limits, motor]
+    return library(*columns).concatenate(columns, axis=1)
