@@ -13,7 +13,7 @@ from vision.models import learned
 import dano
 from dano.identification import Motion
 from dano.pixels import draw_frames, film, identify_in_film
-from dano.pixels._identify import _with_table
+from dano.pixels._identify import _with_table, SETTLED
 from dano.report import draw_simulated, write_identification_report
 from dano.vision import Camera, Film, GAMMA, LearnedField, Light, PosedCamera, SurfaceModel, TrackOptions
 
@@ -237,6 +237,8 @@ def test_pixels_pull_poses_back_that_are_all_wrong_in_one_direction(scene, look,
     assert float(found.poses.values["mu"]) == pytest.approx(slid_with, rel=0.01)
     assert float(found.fit.values["mu"]) == pytest.approx(0.3, rel=0.03)
     assert found.fit.standard_errors["mu"] >= found.poses.standard_errors["mu"]
+    # They had something to add: the first pass moved the value by more than ends a search.
+    assert found.settled and found.moves[0] > SETTLED > found.moves[-1]
 
 
 @pytest.mark.slow
@@ -247,9 +249,13 @@ def test_pixels_that_repeat_the_poses_end_the_search(scene, look, watched):
     assert found.settled and len(found.history) == 2
     assert found.fit is found.poses
     assert abs(float(found.fit.values["mu"]) / 0.3 - 1) < 0.02
-    # What the pixels of that pass said is there to be compared.
-    moved = float(found.history[1]["mu"]) - float(found.history[0]["mu"])
-    assert abs(moved) < 0.3 * float(found.fit.standard_errors["mu"])
+    # What the pixels of that pass said is there to be compared. They say less than the poses: with them the
+    # error is larger, and a part of it is what they moved the value by.
+    moved = abs(float(found.history[1]["mu"]) - float(found.history[0]["mu"]))
+    assert abs(float(found.history[1]["mu"]) / 0.3 - 1) < 0.02
+    (share,) = found.moves
+    assert share < SETTLED
+    assert moved / share > float(found.fit.standard_errors["mu"])
 
 
 def check_page(found, taken, look, camera, folder):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from dano.vision.trajectory import crossings, Poses, Scenery, smoothed, Solid, solid_of
@@ -297,3 +298,114 @@ def test_a_flight_tells_distances(box, rate):
     for slow in (1e3, 4.0):
         found = [smoothed(slow * times, given, Scenery(box, NOWHERE, table, eye)) for table in (0.0, None)]
         np.testing.assert_array_equal(found[0].poses.position, found[1].poses.position)
+
+
+def spinning(moments, begun, times) -> Rotation:
+    """A free spin by Euler's equations, integrated by SciPy; `begun` is its first angular velocity [F]."""
+
+    def change(_, state):
+        spin, (x, y, z, w) = state[:3], state[3:]
+        rates = np.array([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]])
+        return [*(-np.cross(spin, moments * spin) / moments), *(0.5 * rates @ spin)]
+
+    state = [*begun, 0.0, 0.0, 0.0, 1.0]
+    found = solve_ivp(change, (0, times[-1]), state, t_eval=times, rtol=1e-9, atol=1e-12)
+    return Rotation.from_quat(found.y[3:].T)
+
+
+def test_what_flies_spins_without_torque():
+    """The first frames hardly say how they are turned; those after them tell the spin."""
+    moments = (SIDES**2).sum() - SIDES**2
+    grid = np.stack(np.meshgrid(*[[0, 0.5, 1]] * 3), axis=-1).reshape(-1, 3) * SIDES
+    times = np.arange(12) / 60
+    com = (
+        np.array([0.5, 0.2, 0.3]) + np.outer(times, [0.9, 0.2, 1.5]) - np.outer(times**2, [0, 0, 0.5 * 9.81])
+    )
+    orientation = spinning(moments, [6.0, 9.0, 3.0], times)
+    # Independent of the integration: angular momentum and energy stay.
+    between = (orientation[:-1].inv() * orientation[1:]).as_rotvec() * 60
+    middle = orientation[:-1] * Rotation.from_rotvec(0.5 * between / 60)
+    momentum = middle.apply(moments * between)
+    np.testing.assert_allclose(momentum, momentum[:1].repeat(11, axis=0), atol=0.02 * np.abs(momentum).max())
+    position = com - orientation.apply(0.5 * SIDES)
+    spread = np.tile(np.diag(SURE), (12, 1, 1))
+    spread[:3, 3:, 3:] *= 50
+    given = seen(position, orientation, spread, 2)
+    assert np.linalg.norm(off(given, position, orientation)[:3, 3:], axis=1).max() > 0.2
+    still, errors = np.zeros(11, bool), []
+    for uneven in ([1, 1, 1], [1.05, 1.0, 0.95], [1.25, 0.95, 0.85], None):
+        inertia = None if uneven is None else np.diag(moments * uneven) / 12
+        solid = solid_of(grid, 0.5 * SIDES, inertia)
+        found = smoothed(times, given, Scenery(solid, still, 0.0, np.array([0.6, -0.9, 0.8])))
+        errors.append(np.linalg.norm(off(found.poses, position, orientation)[:, 3:], axis=1))
+    # Least of all may what is filled quite unevenly be turned as if it were not.
+    known, beside, far, unknown = errors
+    assert known.max() < np.radians(0.3) and beside.max() < np.radians(0.8)
+    assert 2 * known[0] < unknown[0]
+    assert far.max() < 2 * unknown.max()
+
+
+@pytest.mark.parametrize("larger", [1.0, 4.0])
+def test_frames_that_are_too_sure_are_found_out(box, larger):
+    times, position, orientation = truth()
+    spread = np.tile(np.diag(SURE), (FRAMES, 1, 1))
+    given = seen(position, orientation, larger * spread, 4, covariance=spread**2)
+    found = smoothed(times, given, Scenery(box, NOWHERE))
+    assert 0.5 * larger**2 <= found.inflation <= 2 * larger**2
+
+
+def test_what_is_hit_again_and_again_is_where_frames_have_it(box):
+    """Its blows are no errors of frames: these stay as sure as they are."""
+    rng = np.random.default_rng(7)
+    times = np.arange(FRAMES) / 60
+    # Every fourth frame it is hit: another velocity, another spin.
+    ways, turns = (size * rng.normal(size=(FRAMES // 4, 3)) for size in (0.05 * SIDES.max(), np.radians(8)))
+    position, turn = (np.cumsum(np.repeat(steps, 4, axis=0), axis=0) for steps in (ways, turns))
+    orientation = Rotation.from_rotvec(turn)
+    given = seen(position, orientation, np.tile(np.diag(SURE), (FRAMES, 1, 1)), 8)
+    found = smoothed(times, given, Scenery(box, NOWHERE))
+    before, after = (np.abs(off(poses, position, orientation)) for poses in (given, found.poses))
+    assert found.inflation <= 2
+    assert (np.median(after, axis=0) < 1.2 * np.median(before, axis=0)).all()
+    assert after[:, 3:].max() < 1.5 * before[:, 3:].max()
+
+
+def test_between_two_blows_a_frame_that_is_sure_decides(box):
+    """One turn of 5° to a side within a frame looks like an error of this frame."""
+    times, position, orientation = truth()
+    turns = [Rotation.from_rotvec([0, 0, 0.09 * (i == 12)]) for i in range(FRAMES)]
+    orientation = Rotation.concatenate([turn * one for turn, one in zip(turns, orientation, strict=True)])
+    given = seen(position, orientation, np.tile(np.diag(SURE), (FRAMES, 1, 1)), 9)
+    errors = []
+    for sure in (None, np.arange(FRAMES) == 12):
+        found = smoothed(times, given, Scenery(box, NOWHERE, sure=sure))
+        errors.append(np.linalg.norm(off(found.poses, position, orientation)[:, 3:], axis=1))
+    passed, stayed = errors
+    assert passed[12] > 0.08 and stayed.max() < 0.02
+    assert np.delete(passed, 12).max() < 0.02
+
+
+def test_what_rolls_over_a_table_is_not_in_it(box):
+    """It stands on a corner, hit again and again; one frame has it too deep, along the line of sight."""
+    rng = np.random.default_rng(3)
+    times = np.arange(FRAMES) / 60
+    turn = np.cumsum(np.repeat(np.radians(8) * rng.normal(size=FRAMES // 4), 4))
+    orientation = Rotation.from_rotvec(np.outer(turn, [0, 0, 1.0])) * Rotation.from_rotvec([0.7, 0.4, 0])
+    ways = np.cumsum(0.05 * SIDES.max() * rng.normal(size=(FRAMES, 2)), axis=0)
+    lowest = np.array([one.apply(box.corners)[:, 2].min() for one in orientation])
+    position = np.column_stack([ways, -lowest])
+    sight = np.array([0.3, 0.75, -0.6]) / np.linalg.norm([0.3, 0.75, -0.6])
+    spread = np.tile(np.diag(SURE), (FRAMES, 1, 1))
+    spread[:, :3, :3] += 0.02 * SIDES.max() * np.outer(sight, sight)
+    given = seen(position, orientation, np.tile(0.1 * np.diag(SURE), (FRAMES, 1, 1)), 5)
+    given = given._replace(covariance=spread @ np.swapaxes(spread, 1, 2))
+    given.position[13] += 0.06 * SIDES.max() * sight
+    errors = []
+    for table in (None, 0.0):
+        found = smoothed(times, given, Scenery(box, NOWHERE, table))
+        assert not found.supported.any()
+        errors.append(np.linalg.norm(off(found.poses, position, orientation)[:, :3], axis=1) / SIDES.max())
+    free, known = errors
+    assert known[13] < 0.03 and known[13] < 0.7 * free[13]
+    # The others are not lifted by it.
+    assert np.median(known) < 1.5 * np.median(free)

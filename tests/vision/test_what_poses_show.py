@@ -9,7 +9,7 @@ from vision.drawn_films import fine_frame, LIGHT, path, SIZE
 
 from dano import HalfSpace, Pose
 from dano.maths import quat_conjugate, quat_exp, quat_multiply, quat_rotate, quat_to_matrix
-from dano.scene_file import asset_look
+from dano.scene_file import asset_look, load_asset
 from dano.vision import Camera, compose, Item, Light
 from dano.vision.capture import PosedCamera
 from dano.vision.drawing import GAMMA
@@ -461,3 +461,13 @@ def test_a_doubt_of_the_turn_is_one_about_the_middle(bunny):
         middle[:3, 3 + k] = (moved - quat_to_matrix(turn) @ far.centre) / 1e-6
     np.testing.assert_allclose(middle @ away @ middle.T, shared_covariance(near, turn), atol=1e-10)
     assert away[0, 0] > 3 * shared_covariance(near, turn)[0, 0]
+
+
+@pytest.mark.parametrize("name", ["trained_bunny", "trained_soap"])
+def test_a_look_has_the_centre_of_mass_and_the_inertia_of_its_object(name):
+    """An object's come from its closed surface and its density; a look knows where it is solid."""
+    known, solid = load_asset(name).mass, Subject(asset_look(name)).solid
+    assert solid.inertia is not None
+    np.testing.assert_allclose(solid.com, known.com, atol=0.002 * solid.size)
+    expected = np.asarray(known.inertia) / float(known.mass)
+    np.testing.assert_allclose(solid.inertia, expected, atol=0.01 * np.trace(expected))

@@ -23,9 +23,10 @@ from dano.vision import (
     TrackOptions,
 )
 
-_SETTLED = 0.25
-"""Move of a parameter, in its standard errors, that ends the search: each pass moves it by about half of what
-the one before did, and as much is left."""
+SETTLED = 0.25
+"""Move of a parameter that ends the search, in the standard errors that it has then: each pass moves it by
+about half of what the one before did, and as much is left. Not in those of the poses alone: where pixels say
+less than the poses, their share makes the error larger, and by that much they may differ by chance."""
 
 _NEARBY = 2.0
 """Standard deviations of what pixels alone say up to which poses agree with them."""
@@ -57,6 +58,8 @@ class FilmFit(NamedTuple):
     # Values of the parameters after each pass, the first of them from the poses alone.
     history: tuple[Mapping[str, Any], ...]
     settled: bool  # Whether the last pass moved no value by more than a quarter of its standard error
+    # Largest move of a value in each pass, in the standard errors that values have after it
+    moves: tuple[float, ...]
 
     @property
     def lamps(self) -> tuple[Light, ...]:
@@ -86,9 +89,9 @@ def identify_in_film(
     Covariances of frames grow until frames disagree with the simulation by no more than they say.
 
     Where most poses lie within two standard deviations of where the pixels want them, and the first step
-    moves no value by more than a quarter of its standard error, pixels say what the poses said. The fit of
-    the poses is the result then, and the search ends. Standard errors are never smaller than those from the
-    poses. Memory is that of one frame beside the rollout.
+    moves no value by more than a quarter of the standard error that it has then, pixels say what the poses
+    said. The fit of the poses is the result then, and the search ends. Standard errors are never smaller than
+    those from the poses. Memory is that of one frame beside the rollout.
 
     Args:
         scene: The scene, with values for whatever is not a parameter.
@@ -117,6 +120,7 @@ def identify_in_film(
     refit = functools.partial(identify, scene, parameters=parameters, **settings)
     before = refit(observed=motion, options=options)
     fit, history, settled, lamps = before, [before.values], False, None
+    moves: list[float] = []
     found, pulled, more = None, None, {"background": background, "progress": settings.get("progress")}
     for k in range(_PASSES):
         seen = fit.fitted[0]
@@ -127,16 +131,16 @@ def identify_in_film(
         pulled = _fused(alone, motion, _disagreement(alone, seen))
         last, fit = fit, refit(observed=pulled, after=fit, options=on_the_way)
         history.append(fit.values)
-        moved = _moved(last, fit)
-        if k == 0 and moved < _SETTLED and _agree(alone, motion):
+        moves.append(moved := _moved(last, fit))
+        if k == 0 and moved < SETTLED and _agree(alone, motion):
             # The poses were made of these pixels, which have nothing to add.
-            return FilmFit(before, before, found, tuple(history), True)
-        if settled := moved < _SETTLED and k + 1 >= _LIGHT_PASSES:
+            return FilmFit(before, before, found, tuple(history), True, tuple(moves))
+        if settled := moved < SETTLED and k + 1 >= _LIGHT_PASSES:
             break
     assert found is not None and pulled is not None
     if options.smooth:
         fit = refit(observed=pulled, after=fit, options=options)
-    return FilmFit(_no_smaller(fit, before), before, found, tuple(history), settled)
+    return FilmFit(_no_smaller(fit, before), before, found, tuple(history), settled, tuple(moves))
 
 
 def _agree(pulled: Motion, motion: Motion) -> bool:

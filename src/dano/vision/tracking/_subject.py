@@ -104,11 +104,14 @@ class Subject:
 
     @functools.cached_property
     def solid(self) -> Solid:
-        """What lies and slides: its hull, and its centre of mass if it is equally dense."""
+        """What lies, slides and flies: its hull, centre of mass and inertia if it is equally dense."""
         values, box = np.asarray(self._field.model.distances), self._field.model.box
         inside = np.argwhere(values < 0)
         points = box.origin + box.spacing * crossings(values)
-        return solid_of(points, box.origin + box.spacing * inside.mean(axis=0))
+        # Each node stands for its cell.
+        spread = box.spacing**2 * (np.cov(inside.T, bias=True) + np.eye(3) / 12)
+        inertia = np.trace(spread) * np.eye(3) - spread
+        return solid_of(points, box.origin + box.spacing * inside.mean(axis=0), inertia)
 
     def clearance(self, place: Placement, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Distance of points [m, W] from the object's surface [m], less than 0 inside."""

@@ -3,9 +3,10 @@
 Least squares over all frames: what the pixels of a frame say of its pose, as a Gaussian (`Poses`); third
 differences of position and rotation, which vanish under constant acceleration and spin; differences between
 frames in which the object lies still; and, above a known table, height and tilt of an object that lies or
-slides on one of its faces, and g where it falls freely. A wrong size of the object moves it along the line of
-sight in all frames alike. Weights of frames, of differences and of what a table says are those of Student's
-and Cauchy's distributions, found again in every step (iteratively reweighted least squares).
+slides on one of its faces, that it is not in the table, and g and a free spin where it falls freely. A wrong
+size of the object moves it along the line of sight in all frames alike. Weights of frames, of differences and
+of what a table says are those of Student's and Cauchy's distributions, found again in every step (iteratively
+reweighted least squares).
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
+from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate, quat_to_matrix
 from dano.vision.trajectory._poses import Poses, stretches
 from dano.vision.trajectory._support import (
     AIR,
@@ -27,6 +28,8 @@ from dano.vision.trajectory._support import (
     GRAVITY,
     no_flight,
     Solid,
+    uneven,
+    unlike_free_spin,
 )
 
 _STEADY = 0.004
@@ -41,8 +44,19 @@ _LEVEL, _FLAT = 1.5e-3, 2e-3
 _BASE, _LEAN = 4e-3, 3e-3
 """By how much the learned face may lie beside the true one: height [sizes] and tilt [rad], one for a film."""
 
+_SUNK = 2 * _BASE
+"""Depth in the table from which frames are not believed [sizes]. With none, errors of frames would lift a
+thing that touches it: only those below the table count."""
+
 _LOADED = 0.03
 """By how much the centre of mass may lie beside that of an even filling [sizes], one for a film."""
+
+_UNEVEN = 0.03
+"""By how much moments of inertia may lie beside those of an even filling, as shares, one for a film."""
+
+_TWISTED = 0.03
+"""Angular acceleration in a flight beside that of a free spin, over the spin's square, in a frame: air, and
+what three frames do not show of a turn."""
 
 _ABOVE, _TILTED = 0.06, np.radians(8)
 """Height [sizes] and tilt [rad] up to which an object lies on a face; more, where poses are less certain."""
@@ -66,13 +80,19 @@ _ENDED = 1e-6
 """Largest change [sizes, rad] that ends them."""
 
 _CALIBRATIONS = 3
-"""Motions that are found, each with covariances of frames as the one before tells them."""
+"""Motions that are found where a thing lies on a table, each with variances as the one before tells them."""
 
 _LEAST_FREE = 1.0
 """Least number of six that a frame is free in from its own motion (convention)."""
 
 _MEDIAN = 0.8914
 """Of χ² with six degrees of freedom, over six."""
+
+_LARGEST = 2.0**12
+"""Factor of variances of frames that is not tried any more (convention)."""
+
+_CLEARER = 1.0
+"""By how much logarithms of densities must differ for variances to be twice as large: e times as likely."""
 
 _EPSILON = 1e-6
 """Step of differences [sizes, rad]."""
@@ -87,7 +107,7 @@ class Smoothed(NamedTuple):
     supported: Bool[np.ndarray, " T"]  # Frames in which the object lies or slides on a face, shape (T,)
     # What frames by themselves say less the motion: in sizes [W] and [rad, F], shape (T, 6).
     away: Float[np.ndarray, "T 6"]
-    inflation: float  # Factor by which variances of frames were too small
+    inflation: float  # Factor by which variances of frames were too small, in the median
     # In how many poses what one frame says is found again, ≥ 1, shape (T,); NaN where there is none. Poses
     # that frames share have small covariances, but are not independent: with covariances so many times larger
     # they say together, as if they were, what the frames say together.
@@ -109,6 +129,9 @@ class Scenery(NamedTuple):
     # How many of their standard deviations all frames may be off alike, because of what is wrong in all of
     # them, such as the object's own shadow beside it.
     alike: float = 0.0
+    # Frames whose pictures are known to be as they say, not as a steadier motion would have them, shape (T,):
+    # where such a frame disagrees, something hit the object. None: none is.
+    sure: Bool[np.ndarray, " T"] | None = None
 
 
 def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> Smoothed:
@@ -128,31 +151,53 @@ def smoothed(times: Float[np.ndarray, " T"], poses: Poses, scenery: Scenery) -> 
     # Frames of a thing that lies still are one picture with much the same errors: together they say as much.
     together = _together(resting, len(rows))
     seen = seen._replace(covariance=seen.covariance * together[:, None, None])
-    problem = _Problem(times[rows], seen, scenery, resting)
-    found = problem.solved(seen, [], no_flight())
+    sure = np.zeros(len(rows), bool) if scenery.sure is None else scenery.sure[rows]
+    problem = _Problem(times[rows], seen, scenery, resting, sure)
+    plain = problem.solved(seen, [], no_flight())
+    found = plain.poses
     # Which face it lies on is seen better once frames agree on a motion.
     runs, flight = [], no_flight()
     if scenery.table is not None:
         runs = _runs(found, scenery.solid, scenery.table)
         flight = flights(times[rows], found, scenery.solid, scenery.table, scenery.eye)
-    inflation, more = 1.0, seen
-    for _ in range(_CALIBRATIONS):
-        inflation = max(1.0, inflation * _disagreement(seen, found, problem.seen(found), together, inflation))
-        more = seen._replace(covariance=inflation * seen.covariance)
-        found = problem.solved(more, runs, flight, scenery.table or 0.0)
+    # Frames may say too much of themselves: by so much that what they say is likeliest, blows included. What
+    # they are off by from the motion does not tell: of a thing that is hit again and again that is the blows.
+    factor, independent = np.ones(len(rows)), float(np.sum(1 / together))
+
+    def solved_with(factor: np.ndarray) -> _Solved:
+        more = seen.covariance * factor[:, None, None]
+        return problem.solved(seen._replace(covariance=more), runs, flight, scenery.table)
+
+    solved = solved_with(factor)
+    while factor[0] < _LARGEST:
+        trial = solved_with(2 * factor)
+        if trial.surprise + 3 * independent * np.log(2) > solved.surprise - _CLEARER:
+            break
+        factor, solved = 2 * factor, trial
+    # What all frames are off by alike only a table shows.
+    lying = np.unique(np.concatenate([np.zeros(0, int), *(run.rows for run in runs)]))
+    if len(lying):
+        solved, factor[lying] = plain, 1.0
+        for _ in range(_CALIBRATIONS):
+            expected = problem.seen(solved.poses, solved.further)
+            ratio = _disagreement(seen, solved.poses, expected, factor)[lying]
+            factor[lying] = np.maximum(1, factor[lying] * _middle(ratio, 1 / together[lying]) / _MEDIAN)
+            solved = solved_with(factor)
+    found = solved.poses
     result = Poses(*(x.copy() for x in poses))
     for whole, part in zip(result, found, strict=True):
         whole[rows] = part
-    weight[rows] = np.minimum(problem.weight, 1.0)
+    weight[rows] = np.minimum(solved.weight, 1.0)
     for run in runs:
         supported[rows[run.rows]] = True
     unit = np.repeat([scenery.solid.size, 1.0], 3)
-    away[rows] = difference(problem.seen(found), seen) / unit
+    away[rows] = difference(problem.seen(found, solved.further), seen) / unit
     # The share of a pose that its own frame decides, of one that all others know nothing of.
-    own = problem.weight * np.einsum("nij,nji->n", np.linalg.inv(more.covariance), found.covariance) / 6
+    told = solved.weight / factor
+    own = told * np.einsum("nij,nji->n", np.linalg.inv(seen.covariance), found.covariance) / 6
     repeats = np.full(n, np.nan)
     repeats[rows] = np.clip(1 / own, 1, len(rows))
-    return Smoothed(result, weight, supported, away, inflation, repeats)
+    return Smoothed(result, weight, supported, away, float(np.median(factor)), repeats)
 
 
 def _together(resting: np.ndarray, n: int) -> Float[np.ndarray, " n"]:
@@ -162,18 +207,22 @@ def _together(resting: np.ndarray, n: int) -> Float[np.ndarray, " n"]:
 
 
 def _disagreement(
-    seen: Poses, found: Poses, expected: Poses, together: np.ndarray, inflation: float
-) -> float:
-    """Variance of what frames are off by from their motion, over what their inflated covariances say."""
+    seen: Poses, found: Poses, expected: Poses, factor: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Variances of what frames are off by from their motion, over so many times what they say."""
     away = difference(expected, seen)
-    inverse = np.linalg.inv(inflation * seen.covariance)
+    inverse = np.linalg.inv(seen.covariance * factor[:, None, None])
     square = np.einsum("ni,nij,nj->n", away, inverse, away)
     # What a frame itself contributed to the motion does not show.
     free = 6 - np.einsum("nij,nji->n", inverse, found.covariance)
-    ratio = square / np.maximum(free, _LEAST_FREE)
-    order = np.argsort(ratio)
-    share = np.cumsum((1 / together)[order])
-    return float(ratio[order][np.searchsorted(share, 0.5 * share[-1])] / _MEDIAN)
+    return square / np.maximum(free, _LEAST_FREE)
+
+
+def _middle(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> float:
+    """Weighted median."""
+    order = np.argsort(values)
+    share = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
 
 
 def difference(first: Poses, second: Poses) -> Float[np.ndarray, "*batch n 6"]:
@@ -194,12 +243,21 @@ class _Minimum(NamedTuple):
 
     poses: Poses  # Of the frames
     # Height and tilts of the face of each run; where the centre of mass lies beside the expected one [sizes,
-    # F], if there is a flight; how many standard deviations all frames are off alike, six numbers; then the
-    # share by which they see too far.
+    # F], if there is a flight; by which shares its inertia does, six numbers, if that is known; how many
+    # standard deviations all frames are off alike, six numbers; then the share by which they see too far.
     shared: Float[np.ndarray, " m"]
     weight: Float[np.ndarray, " n"]
     cost: float
     inverse: Any
+
+
+class _Solved(NamedTuple):
+    """The best of such minima."""
+
+    poses: Poses  # With covariances
+    weight: Float[np.ndarray, " n"]  # Of the frames
+    further: float  # The share by which all frames see it too far
+    surprise: float  # How unlikely the frames are, as the logarithm of a density less a constant
 
 
 def _at_rest(still: np.ndarray, rows: np.ndarray) -> Int[np.ndarray, "m 2"]:
@@ -232,24 +290,25 @@ def _runs(poses: Poses, solid: Solid, table: float) -> list[_Run]:
 class _Problem:
     """Least squares over the frames that have a pose (host)."""
 
-    def __init__(self, times: np.ndarray, poses: Poses, scenery: Scenery, resting: np.ndarray):
-        self._poses, self._solid, self._resting = poses, scenery.solid, resting
+    def __init__(
+        self, times: np.ndarray, poses: Poses, scenery: Scenery, resting: np.ndarray, sure: np.ndarray
+    ):
+        self._poses, self._solid, self._resting, self._sure = poses, scenery.solid, resting, sure
         solid, self._eye = scenery.solid, scenery.eye
         self._alike = np.maximum([*[scenery.alike] * 6, scenery.scale], _EPSILON)
-        self._further = 0.0
         self._unit = np.repeat([solid.size, 1.0], 3)
         self._roots = np.zeros((len(times), 6, 6))
         n = len(times)
         self._fours = np.arange(max(n - 3, 0))[:, None] + np.arange(4)
         self._rates = _third_differences(times[self._fours])
-        self.weight = self._weight = np.ones(n)
+        self._weight = np.ones(n)
         self._tolerance, self._cost = 1.0, 0.0
         self._runs: list[_Run] = []
         self._flight = no_flight()
-        self._table = 0.0
+        self._table: float | None = None
 
-    def solved(self, poses: Poses, runs: list[_Run], flight: Flight, table: float = 0.0) -> Poses:
-        """Poses at the minimum, with their covariance, given those of frames, and where it lies or falls.
+    def solved(self, poses: Poses, runs: list[_Run], flight: Flight, table: float | None = None) -> "_Solved":
+        """The minimum, given poses of frames, and where it lies or falls.
 
         Single wrong frames and blows both break a steady motion. At first differences keep their weight,
         which finds the wrong frames. Then each stretch that is not believed is tried as its frames have it.
@@ -257,23 +316,24 @@ class _Problem:
         self._poses, self._runs, self._flight, self._table = poses, runs, flight, table
         self._roots = np.linalg.inv(np.linalg.cholesky(poses.covariance / np.outer(self._unit, self._unit)))
         best = self._descended(self._poses, np.zeros(len(self._doubts)), _TOLERANT)
-        for first, last in stretches(best.weight < _DOUBTED):
+        for first, last in stretches((best.weight < _DOUBTED) | self._sure):
             rows = slice(first, last)
             begun = Poses(*(x.copy() for x in best.poses))
             for whole, own in zip(begun, self._poses, strict=True):
                 whole[rows] = own[rows]
             other = self._descended(begun, best.shared, 1.0)
             best = min(best, other, key=lambda one: one.cost)
-        self.weight, self._further = best.weight, float(best.shared[-1])
         n = len(self._poses.position)
         blocks = np.stack([_block(best.inverse, k, 6 * n + len(best.shared)) for k in range(n)])
-        return best.poses._replace(covariance=blocks * np.outer(self._unit, self._unit))
+        found = best.poses._replace(covariance=blocks * np.outer(self._unit, self._unit))
+        # Of all motions together, not of the likeliest only (Laplace's approximation).
+        many = 0.5 * float(np.sum(np.log(np.abs(best.inverse.U.diagonal()))))
+        return _Solved(found, best.weight, float(best.shared[-1]), best.cost + many)
 
-    def seen(self, poses: Poses, further: float | None = None) -> Poses:
-        """What frames are expected to say of poses, all further away by a share; default: as was found."""
+    def seen(self, poses: Poses, share: float) -> Poses:
+        """What frames are expected to say of poses that all seem to be further away by a share."""
         if self._eye is None:
             return poses
-        share = self._further if further is None else further
         arm = quat_rotate(poses.orientation, np.broadcast_to(self._solid.middle, poses.position.shape))
         return poses._replace(position=poses.position + share * (poses.position + arm - self._eye))
 
@@ -304,9 +364,14 @@ class _Problem:
         rows += [_spread(frames, slopes, residual) for frames, slopes, residual in parts]
         for k, run in enumerate(self._runs):
             rows.append(self._lying(poses, run, shared[3 * k : 3 * k + 3], 6 * n + 3 * k))
+        column = 3 * len(self._runs)
         if len(self._flight.threes):
-            column = 3 * len(self._runs)
             rows.append(self._falling(poses, shared[column : column + 3], 6 * n + column))
+        if self._spins:
+            column += 3
+            rows.append(self._spinning(poses, shared[column : column + 6], 6 * n + column))
+        if self._table is not None:
+            rows.append(_spread(*self._outside(poses, self._table)))
         rows.append(self._prior(shared, width))
         return _joined(rows, width), np.concatenate([part.residual for part in rows])
 
@@ -315,7 +380,12 @@ class _Problem:
         """Standard deviations of what is shared by frames (see `_Minimum`)."""
         lying = np.tile([_BASE, _LEAN, _LEAN], len(self._runs))
         falling = np.full(3 if len(self._flight.threes) else 0, _LOADED)
-        return np.concatenate([lying, falling, self._alike])
+        spinning = np.full(6 if self._spins else 0, _UNEVEN)
+        return np.concatenate([lying, falling, spinning, self._alike])
+
+    @property
+    def _spins(self) -> bool:
+        return len(self._flight.threes) > 0 and self._solid.inertia is not None
 
     def _prior(self, shared: np.ndarray, width: int) -> "_Part":
         """How far a learned object may differ from the true one; a face as by Student's distribution.
@@ -324,27 +394,40 @@ class _Problem:
         one may be, then its height is not believed either. What a known table cut off is flat, and was there.
         """
         known = 1 / self._doubts
-        faces = known[: 3 * len(self._runs)].reshape(-1, 3)
-        square = np.sum((faces * shared[: faces.size].reshape(-1, 3)) ** 2, axis=1)
+        faces, spins = 3 * len(self._runs), 6 * self._spins
+        scaled = known * shared
+        square = np.sum(scaled[:faces].reshape(-1, 3) ** 2, axis=1)
         cut = np.array([run.face.cut for run in self._runs], bool)
         weight, cost = _by_student(np.where(cut, 0, square), 3)
         weight[cut] = 1.0
-        self._cost += cost + 0.5 * float(square[cut].sum() + np.sum((known * shared)[faces.size :] ** 2))
-        known[: faces.size] *= np.repeat(np.sqrt(weight), 3)
+        self._cost += cost + 0.5 * float(square[cut].sum())
+        known[:faces] *= np.repeat(np.sqrt(weight), 3)
+        filling = slice(len(shared) - 7 - spins, len(shared) - 7)
+        if spins:
+            # Few things are filled unevenly, but these may be so by much.
+            weight, cost = _by_student(np.sum(scaled[filling] ** 2, keepdims=True), 6)
+            known[filling] *= np.sqrt(weight)
+            self._cost += cost
+        rest = np.delete(scaled, filling)[faces:]
+        self._cost += 0.5 * float(np.sum(rest**2))
         rows = np.arange(len(shared))
         return _Part(known, rows, width - len(shared) + rows, known * shared)
 
     def _said(self, poses: Poses, alike: Float[np.ndarray, "7"], width: int) -> "_Part":
-        """What frames say, weighted as by Student's distribution."""
+        """What frames say, weighted as by Student's distribution; as by that of Gauss if they are sure."""
+        # What is wrong in all frames alike belongs to where it lies.
+        lying = np.zeros((len(poses.position), 1))
+        lying[[k for run in self._runs for k in run.rows]] = 1.0
 
         def away(moved: Poses, alike: np.ndarray = alike) -> np.ndarray:
             apart = difference(self._poses, self.seen(moved, alike[-1])) / self._unit
-            return np.einsum("nij,...nj->...ni", self._roots, apart) + alike[:6]
+            return np.einsum("nij,...nj->...ni", self._roots, apart) + lying * alike[:6]
 
         residual = away(poses)
         square = np.sum(residual**2, axis=1)
-        self._weight, cost = _by_student(square, 6)
-        self._cost += cost
+        self._weight, cost = _by_student(np.where(self._sure, 0, square), 6)
+        # As narrow as Student's in its middle.
+        self._cost += cost + 0.5 * (1 + 6 / _FREEDOM) * float(square[self._sure].sum())
         root = np.sqrt(self._weight)[:, None]
         part = self._linear(away, poses, np.arange(len(square))[:, None], root)
         slopes = [away(poses, alike + _EPSILON * e) - residual for e in np.eye(7)]
@@ -368,6 +451,23 @@ class _Problem:
         weight = 4 / (1 + squares / self._tolerance**2)
         self._cost += 2 * float(np.sum(np.log1p(squares)))
         return self._linear(jerk, poses, self._fours, np.sqrt(np.repeat(weight, 3, axis=1)))
+
+    def _outside(self, poses: Poses, table: float):
+        """How deep the lowest corner of what does not lie there is in the table, where it cannot be."""
+        lies = np.isin(np.arange(len(poses.position)), [k for run in self._runs for k in run.rows])
+        rows, corners = np.flatnonzero(~lies), self._solid.corners
+        heights = quat_to_matrix(poses.orientation[rows])[:, 2] @ corners.T
+        lowest = corners[np.argmin(heights, axis=1)]
+
+        def under(moved: Poses) -> np.ndarray:
+            turn = moved.orientation[..., rows, :]
+            height = moved.position[..., rows, :] + quat_rotate(
+                turn, np.broadcast_to(lowest, (*turn.shape[:-1], 3))
+            )
+            return np.minimum((height[..., 2:] - table) / self._solid.size + _SUNK, 0) / _BASE
+
+        self._cost += 0.5 * float(np.sum(under(poses) ** 2))
+        return self._linear(under, poses, rows[:, None], np.ones((len(rows), 1)))
 
     def _rest(self, poses: Poses):
         """What changes between frames in which nothing moves."""
@@ -412,7 +512,7 @@ class _Problem:
 
     def _falling(self, poses: Poses, shared: np.ndarray, column: int) -> "_Part":
         """Acceleration of the centre of mass less g, by Cauchy's distribution: something may push it."""
-        (threes, rates), size = self._flight, self._solid.size
+        (threes, rates, _), size = self._flight, self._solid.size
 
         def pushed(moved: Poses, beside: np.ndarray) -> np.ndarray:
             com = centres_of_mass(moved, self._solid.com + size * beside)
@@ -420,8 +520,18 @@ class _Problem:
 
         return self._allowing(pushed, poses, shared, threes, column)
 
+    def _spinning(self, poses: Poses, shared: np.ndarray, column: int) -> "_Part":
+        """Change of the spin less that without torque, by Cauchy's distribution: something may push it."""
+        inertia = self._solid.inertia
+        assert inertia is not None
+
+        def twisted(moved: Poses, beside: np.ndarray) -> np.ndarray:
+            return unlike_free_spin(moved.orientation, self._flight, uneven(inertia, beside)) / _TWISTED
+
+        return self._allowing(twisted, poses, shared, self._flight.threes, column)
+
     def _allowing(self, function, poses: Poses, shared, frames: np.ndarray, column: int) -> "_Part":
-        """Residuals of frames and three numbers that they share, by Cauchy's distribution, and derivatives.
+        """Residuals of frames and some numbers that they share, by Cauchy's distribution, and derivatives.
 
         Args:
             function: Of poses and these numbers, shape (m, r).
@@ -435,7 +545,7 @@ class _Problem:
         root = np.sqrt(4 / (1 + square / self._tolerance**2))[:, None]
         self._cost += 2 * float(np.sum(np.log1p(square)))
         part = self._linear(lambda moved: function(moved, shared), poses, frames, root)
-        slopes = [(function(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(3)]
+        slopes = [(function(poses, shared + _EPSILON * e) - plain) / _EPSILON for e in np.eye(len(shared))]
         common = np.stack([(root * slope).ravel() for slope in slopes], axis=1)
         return _with_shared(_spread(*part), common, column)
 

@@ -1,6 +1,6 @@
 """How a solid can lie on a table: the faces of its convex hull over which its centre of mass stands.
 
-Where a thing falls freely: its centre of mass then gains g, whatever else it does.
+Where a thing falls freely: its centre of mass then gains g, and it spins as Euler's equations say.
 """
 
 from typing import NamedTuple
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dano.fields import convex_hull
-from dano.maths import quat_rotate
+from dano.maths import quat_conjugate, quat_log, quat_multiply, quat_rotate
 from dano.vision.trajectory._poses import Poses, stretches
 
 _STEADY = 0.05
@@ -39,10 +39,16 @@ class Solid(NamedTuple):
     com: Float[np.ndarray, "3"]  # Centre of mass [m, F]
     corners: Float[np.ndarray, "n 3"]  # Of its convex hull [m, F]
     faces: tuple[Face, ...]  # On which it can lie
+    # Inertia over mass about the centre of mass [m², F]; None: how it spins by itself is not known.
+    inertia: Float[np.ndarray, "3 3"] | None = None
 
 
-def solid_of(points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]) -> Solid:
-    """A solid from points of its surface and its centre of mass, both [m, F].
+def solid_of(
+    points: Float[np.ndarray, "n 3"],
+    com: Float[np.ndarray, "3"],
+    inertia: Float[np.ndarray, "3 3"] | None = None,
+) -> Solid:
+    """A solid from points of its surface, its centre of mass, both [m, F], and inertia over mass [m², F].
 
     It lies on a face of the hull if the foot of the perpendicular from the centre of mass lies on that face.
     The hull of a learned surface has many small faces where the true one has a large face. The foot lies on
@@ -68,7 +74,7 @@ def solid_of(points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]) -> S
             on = np.abs((points - foot[i]) @ normal[i]) < _PLANE * size
             faces.append(Face(normal[i], foot[i], bool(on.sum() >= _MANY)))
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    return Solid(size, middle, np.asarray(com, np.float64), corners, tuple(faces))
+    return Solid(size, middle, np.asarray(com, np.float64), corners, tuple(faces), inertia)
 
 
 def crossings(values: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]:
@@ -103,6 +109,9 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 AIR = 0.3
 """Standard deviation of what air adds to it in a frame [m/s²]: a box of 100 g at 2 m/s is slowed by 0.1."""
 
+_SLOW = 3.0
+"""Spin below which a change of it is compared with this one's square [rad/s]."""
+
 _CLEAR = 0.05
 """Height [sizes] of its lowest corner over the table from which a thing touches nothing."""
 
@@ -123,11 +132,13 @@ class Flight(NamedTuple):
     threes: Int[np.ndarray, "m 3"]  # Neighbouring frames, shape (m, 3)
     # Weights of their positions that make an acceleration [1/s²], shape (m, 3).
     rates: Float[np.ndarray, "m 3"]
+    # Weights that make a velocity at the middle frame [1/s], shape (m, 3).
+    slopes: Float[np.ndarray, "m 3"]
 
 
 def no_flight() -> Flight:
     """Where nothing is known of a flight."""
-    return Flight(np.zeros((0, 3), int), np.zeros((0, 3)))
+    return Flight(np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def flights(
@@ -159,7 +170,7 @@ def flights(
     if not threes:
         return no_flight()
     found = np.concatenate(threes)
-    return Flight(found, accelerating(times[found]))
+    return Flight(found, accelerating(times[found]), _moving(times[found]))
 
 
 def centres_of_mass(poses: Poses, com: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*batch n 3"]:
@@ -171,6 +182,39 @@ def accelerating(times: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
     """Weights of positions at three times that make the acceleration of the parabola through them [1/s²]."""
     apart = times[:, :, None] - times[:, None, :] + np.eye(3)
     return 2 / apart.prod(axis=2)
+
+
+def _moving(times: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    """Weights of values at three times that make the slope at the second of the parabola through them."""
+    before, after = np.diff(times, axis=1).T
+    weights = [-after / before, after / before - before / after, before / after]
+    return np.stack(weights, axis=1) / (before + after)[:, None]
+
+
+def unlike_free_spin(
+    orientation: Float[np.ndarray, "*batch n 4"], flight: Flight, inertia: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "*batch m 3"]:
+    """Angular acceleration [F] beside that of a spin without torque (Euler), over the spin's square.
+
+    Args:
+        orientation: Of the frames, object → world.
+        flight: Where it falls freely.
+        inertia: Over mass, about the centre of mass [m², F].
+    """
+    middle = quat_conjugate(orientation[..., flight.threes[:, 1], None, :])
+    turns = quat_log(quat_multiply(middle, orientation[..., flight.threes, :]))
+    # Rotation vectors about a pose have the spin, and its change, for derivatives there.
+    spin, change = (np.einsum("mk,...mki->...mi", w, turns) for w in (flight.slopes, flight.rates))
+    free = -np.cross(spin, spin @ inertia) @ np.linalg.inv(inertia)
+    return (change - free) / (np.sum(spin**2, axis=-1, keepdims=True) + _SLOW**2)
+
+
+def uneven(inertia: Float[np.ndarray, "3 3"], beside: Float[np.ndarray, "6"]) -> Float[np.ndarray, "3 3"]:
+    """An inertia that lies beside another by shares: of moments, three, then three of products."""
+    root = np.linalg.cholesky(inertia)
+    share = np.diag(beside[:3])
+    share[[0, 0, 1], [1, 2, 2]] = share[[1, 2, 2], [0, 0, 1]] = beside[3:]
+    return root @ (np.eye(3) + share) @ root.T
 
 
 def _is_clear(poses: Poses, solid: Solid, table: float) -> Bool[np.ndarray, " n"]:
