@@ -127,7 +127,7 @@ def tracked(frames: int = 3) -> Tracked:
 
 def film_fit(found: Identification, frames: int = 3) -> FilmFit:
     """An identification from a film."""
-    return FilmFit(found, found, tracked(frames), ({"mu": 0.2}, {"mu": 0.3}), True)
+    return FilmFit(found, found, tracked(frames), ({"mu": 0.2}, {"mu": 0.3}), True, (0.1,))
 
 
 def trained(field: LearnedField, photographs: Capture, box: NodeGrid, hull: np.ndarray) -> Trained:

@@ -466,7 +466,9 @@ def test_a_doubt_of_the_turn_is_one_about_the_middle(bunny):
 @pytest.mark.parametrize("name", ["trained_bunny", "trained_soap"])
 def test_a_look_has_the_centre_of_mass_and_the_inertia_of_its_object(name):
     """An object's come from its closed surface and its density; a look knows where it is solid."""
-    known, solid = load_asset(name).mass, Subject(asset_look(name)).solid
+    known, look = load_asset(name).mass, asset_look(name)
+    assert look is not None
+    solid = Subject(look).solid
     assert solid.inertia is not None
     np.testing.assert_allclose(solid.com, known.com, atol=0.002 * solid.size)
     expected = np.asarray(known.inertia) / float(known.mass)

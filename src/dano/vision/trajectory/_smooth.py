@@ -405,7 +405,7 @@ class _Problem:
         filling = slice(len(shared) - 7 - spins, len(shared) - 7)
         if spins:
             # Few things are filled unevenly, but these may be so by much.
-            weight, cost = _by_student(np.sum(scaled[filling] ** 2, keepdims=True), 6)
+            weight, cost = _by_student(np.array([np.sum(scaled[filling] ** 2)]), 6)
             known[filling] *= np.sqrt(weight)
             self._cost += cost
         rest = np.delete(scaled, filling)[faces:]
